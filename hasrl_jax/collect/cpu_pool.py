@@ -1,0 +1,234 @@
+"""The pool of worker processes: starts them, hands out parameters, gathers trajectories, replaces the dead.
+
+Messages are short JSON texts over one connection per worker; parameters and trajectories never pass
+through it but lie in shared memory, double-buffered by the parity of the policy version.
+Source: paper section III.A and Figure 1.
+"""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection, Pipe, wait
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hasrl_jax.collect import shared_memory
+from hasrl_jax.collect.plan import Plan
+from hasrl_jax.config import Config, to_dict
+from hasrl_jax.envs.task import Task
+
+log = logging.getLogger("hasrl_jax")
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")}
+MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in between
+
+
+class WorkerError(RuntimeError):
+    """Workers cannot be started or keep failing; the message carries the cause."""
+
+
+class Collected(NamedTuple):
+    """One iteration's experience: the centralised buffer of the paper.
+
+    `fields` holds flat arrays over the N steps of all workers that finished; trajectory i is the steps
+    `start[i]` to `end[i]`.
+    """
+
+    fields: dict[str, np.ndarray]  # the per-step arrays of shared_memory.slot_specs, [N, ...]
+    start: np.ndarray  # [S] int32, re-based to the centralised buffer
+    end: np.ndarray  # [S] int32
+    initial_carry: np.ndarray  # [S, L, 2, W]
+    version: int
+    statistics: list[dict[str, Any]]  # one per worker that finished
+    seconds: float  # from the request to the last reply
+
+
+class _Worker(NamedTuple):
+    process: subprocess.Popen
+    connection: Connection
+
+
+class CpuPool:
+    """Worker processes that collect in parallel; use as a context manager.
+
+    Args:
+      config: the run's configuration, sent to every worker.
+      plan: sizes from `make_plan(config)`.
+      task: for the sizes of observations and actions.
+
+    Raises:
+      OSError: too little memory for the shared block.
+      WorkerError: the workers do not start; carries the first traceback or exit signal.
+    """
+
+    def __init__(self, config: Config, plan: Plan, task: Task):
+        self.config, self.plan = config, plan
+        self.workers_lost = 0
+        self._failures = [0] * plan.num_workers
+        self._workers: list[_Worker | None] = [None] * plan.num_workers
+        self._block = shared_memory.open_block(config, plan, task.observation_size, task.action_size)
+        self._version = -1
+        self._started = 0.0
+        try:
+            for index in range(plan.num_workers):
+                self._workers[index] = self._spawn(index)
+            for index in range(plan.num_workers):
+                self._await_ready(index)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "CpuPool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def process_ids(self) -> list[int]:
+        """Operating-system process of each worker, in worker order."""
+        return [worker.process.pid for worker in self._workers if worker is not None]
+
+    def start(self, parameters: dict[str, np.ndarray], version: int) -> None:
+        """Asks every worker for one iteration with these parameters; returns at once."""
+        buffer = self._block.parameters[version % shared_memory.NUM_BUFFERS]
+        for name, array in buffer.items():
+            array[:] = parameters[name]
+        self._version, self._started = version, time.monotonic()
+        self._block.heartbeat[:] = self._started
+        for index in range(self.plan.num_workers):
+            self._send(index, {"do": "collect", "version": version})
+
+    def finish(self) -> Collected:
+        """Waits for the iteration that `start` asked for and merges the workers' buffers.
+
+        A worker that dies or falls silent is replaced; only its own part of this iteration is lost.
+
+        Raises:
+          WorkerError: no worker finished, or one failed too many times in a row.
+        """
+        pending = set(range(self.plan.num_workers))
+        statistics: dict[int, dict[str, Any]] = {}
+        while pending:
+            by_connection = {self._workers[index].connection: index for index in pending}
+            for ready in wait(list(by_connection), timeout=1.0):
+                index = by_connection[ready]
+                pending.discard(index)
+                message, cause = self._receive(index)
+                if cause is None and "error" not in message:
+                    statistics[index] = message
+                    self._failures[index] = 0
+                else:
+                    self._replace(index, cause or f"raised\n{message['error']}")
+            pending -= self._replace_silent(pending)
+        if not statistics:
+            raise WorkerError("every worker was lost in the same iteration; see the messages above")
+        return self._merge(statistics)
+
+    def save(self) -> list[bytes]:
+        """The state of every worker's environments; only between `finish` and `start`."""
+        states = []
+        for index, worker in enumerate(self._workers):
+            self._send(index, {"do": "save"})
+            states.append(worker.connection.recv_bytes())
+        return states
+
+    def load(self, states: list[bytes]) -> None:
+        """Restores what `save` returned, when the number of workers is the same."""
+        for index, state in enumerate(states):
+            self._send(index, {"do": "load"})
+            self._workers[index].connection.send_bytes(state)
+            if state:
+                self._workers[index].connection.recv_bytes()
+
+    def close(self) -> None:
+        """Ends all workers and frees the shared memory."""
+        for worker in filter(None, self._workers):
+            worker.connection.close()
+            worker.process.kill()  # it holds nothing that needs tidying
+            worker.process.wait()
+        self._workers = [None] * self.plan.num_workers
+        self._block.close()
+
+    def _spawn(self, index: int) -> _Worker:
+        """A new interpreter that inherits the connection and the shared block, and one thread."""
+        ours, theirs = Pipe()
+        descriptors = (theirs.fileno(), self._block.descriptor)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hasrl_jax.collect.worker", *map(str, descriptors)],
+            pass_fds=descriptors,
+            stdin=subprocess.DEVNULL,
+            env=os.environ | ONE_THREAD,
+        )
+        theirs.close()
+        setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid(), "num_workers": self.plan.num_workers}
+        ours.send_bytes(json.dumps(setup).encode())
+        return _Worker(process, ours)
+
+    def _await_ready(self, index: int) -> None:
+        timeout = self.config.collect.worker_start_timeout_s
+        worker = self._workers[index]
+        if not worker.connection.poll(timeout):
+            raise WorkerError(f"worker {index} did not start within collect.worker_start_timeout_s={timeout:g} s")
+        message, cause = self._receive(index)
+        if cause or "error" in message:
+            raise WorkerError(f"worker {index} did not start: {cause or message['error']}")
+
+    def _send(self, index: int, message: dict[str, Any]) -> None:
+        try:
+            self._workers[index].connection.send_bytes(json.dumps(message).encode())
+        except OSError:
+            pass  # it died; its closed connection says so when the reply is awaited
+
+    def _receive(self, index: int) -> tuple[dict[str, Any], str | None]:
+        """The worker's message and, when it died instead, how."""
+        worker = self._workers[index]
+        try:
+            return json.loads(worker.connection.recv_bytes()), None
+        except (EOFError, OSError):
+            code = worker.process.wait()
+            return {}, f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
+
+    def _replace_silent(self, pending: set[int]) -> set[int]:
+        """Replaces workers without a heartbeat; returns their indices."""
+        limit = self.config.collect.worker_timeout_s
+        silent = {index for index in pending if time.monotonic() - self._block.heartbeat[index] > limit}
+        for index in silent:
+            self._replace(index, f"was silent for collect.worker_timeout_s={limit:g} s")
+        return silent
+
+    def _replace(self, index: int, cause: str) -> None:
+        old = self._workers[index]
+        log.warning("worker %d (process %d) %s; its part of this iteration is lost, starting another", index, old.process.pid, cause)
+        old.connection.close()
+        old.process.kill()
+        old.process.wait()
+        self.workers_lost += 1
+        self._failures[index] += 1
+        if self._failures[index] >= MAX_FAILURES:
+            raise WorkerError(f"worker {index} failed {MAX_FAILURES} times in a row; the last one {cause}")
+        self._workers[index] = self._spawn(index)
+        self._await_ready(index)
+
+    def _merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
+        """Copies the slots into one buffer and shifts their start and end indices accordingly."""
+        slots = self._block.slots[self._version % shared_memory.NUM_BUFFERS]
+        finished = [slots[index] for index in sorted(statistics)]
+        counts = [int(slot["num_segments"][0]) for slot in finished]
+        offsets = [position * self.plan.steps_per_worker for position in range(len(finished))]
+        per_segment = ("start", "end", "initial_carry", "num_segments")
+        return Collected(
+            fields={
+                name: np.concatenate([slot[name] for slot in finished]) for name in finished[0] if name not in per_segment
+            },
+            start=np.concatenate([s["start"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
+            end=np.concatenate([s["end"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
+            initial_carry=np.concatenate([s["initial_carry"][:n] for s, n in zip(finished, counts, strict=True)]),
+            version=self._version,
+            statistics=[statistics[index] for index in sorted(statistics)],
+            seconds=time.monotonic() - self._started,
+        )

@@ -1,0 +1,50 @@
+"""How an iteration's budget of environment steps is divided among workers, environments and trajectories."""
+
+import os
+from typing import NamedTuple
+
+from hasrl_jax.config import Config
+
+
+class Plan(NamedTuple):
+    """Sizes that follow from the configuration and stay fixed for a run."""
+
+    num_workers: int
+    envs_per_worker: int
+    steps_per_env: int  # environment steps of each environment per iteration
+    max_length: int  # T of the trajectories given to the learner
+    rows: int  # B of the trajectories given to the learner; more are used when there are more episodes
+    carry_shape: tuple[int, int, int]  # (L, 2, W)
+
+    @property
+    def steps_per_worker(self) -> int:
+        return self.envs_per_worker * self.steps_per_env
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps per iteration, all workers together."""
+        return self.num_workers * self.steps_per_worker
+
+
+def available_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def make_plan(config: Config) -> Plan:
+    """Rounds the budget up so that every environment collects the same number of steps."""
+    collect = config.collect
+    num_workers = collect.num_workers or available_cores()
+    num_envs = num_workers * collect.envs_per_worker
+    steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
+    minibatch = config.ppo.minibatch_trajectories
+    if collect.mode == "unrolls":
+        max_length = collect.unroll_length
+        steps_per_env = -(-steps_per_env // max_length) * max_length
+        rows = num_envs * steps_per_env // max_length
+    else:
+        max_length = min(collect.max_episode_steps, steps_per_env)
+        rows = minibatch  # episodes vary in number: the batch grows by whole minibatches
+    rows = -(-rows // minibatch) * minibatch
+    width = config.network.hidden_size * (2 if config.network.symmetric else 1)
+    return Plan(num_workers, collect.envs_per_worker, steps_per_env, max_length, rows, (2, 2, width))

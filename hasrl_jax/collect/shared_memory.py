@@ -1,0 +1,134 @@
+"""Memory shared between the pool and its workers.
+
+The block has no name: its file descriptor is inherited by the workers, so it vanishes with the last
+process that holds it, however that process ends. Nothing can be left behind.
+"""
+
+import mmap
+import os
+import tempfile
+
+import numpy as np
+
+from hasrl_jax.collect.numpy_policy import Parameters, parameter_shapes
+from hasrl_jax.collect.plan import Plan
+from hasrl_jax.config import Config
+
+Specs = dict[str, tuple[tuple[int, ...], str]]  # name -> (shape, dtype)
+ALIGNMENT = 64  # bytes, a cache line
+NUM_BUFFERS = 2  # parameters and trajectories are double-buffered: one is written while the other is read
+
+
+def create(size: int) -> int:
+    """A file descriptor of `size` bytes of anonymous shared memory.
+
+    Raises:
+      OSError: the memory cannot be had; the message names the size.
+    """
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("hasrl_jax")
+    else:  # not Linux: an unlinked temporary file serves the same purpose
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    try:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(descriptor, 0, size)  # fails here, and not as SIGBUS at the first write
+        else:
+            os.ftruncate(descriptor, size)
+    except OSError as error:
+        os.close(descriptor)
+        raise OSError(
+            error.errno,
+            f"cannot reserve {size / 2**20:.1f} MiB of shared memory for the workers ({error.strerror}); "
+            "lower collect.env_steps_per_iteration or free memory",
+        ) from None
+    return descriptor
+
+
+def size_of(specs: Specs) -> int:
+    """Bytes that `views` needs."""
+    return sum(_padded(shape, dtype) for shape, dtype in specs.values())
+
+
+def views(memory: mmap.mmap, specs: Specs, offset: int) -> dict[str, np.ndarray]:
+    """Named arrays over `memory`, starting at `offset`."""
+    arrays = {}
+    for name, (shape, dtype) in specs.items():
+        arrays[name] = np.ndarray(shape, dtype, memory, offset)
+        offset += _padded(shape, dtype)
+    return arrays
+
+
+def _padded(shape: tuple[int, ...], dtype: str) -> int:
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    return -(-size // ALIGNMENT) * ALIGNMENT
+
+
+def slot_specs(
+    num_steps: int, num_segments: int, observation_size: int, action_size: int, carry_shape: tuple[int, ...]
+) -> Specs:
+    """One worker's trajectory buffer: flat steps, and the start and end index of each trajectory in them."""
+    step = (num_steps,)
+    return {
+        "observation": ((num_steps, observation_size), "float32"),
+        "action": ((num_steps, action_size), "float32"),
+        "log_prob": (step, "float32"),
+        "value": (step, "float32"),
+        "reward": (step, "float32"),
+        "is_first": (step, "bool"),
+        "terminated": (step, "bool"),
+        "truncated": (step, "bool"),
+        "bootstrap_value": (step, "float32"),
+        "mask": (step, "bool"),
+        "initial_carry": ((num_segments, *carry_shape), "float32"),
+        "start": ((num_segments,), "int32"),
+        "end": ((num_segments,), "int32"),
+        "num_segments": ((1,), "int32"),
+        # Episodes that ended, at the step where they did; zero elsewhere.
+        "episode_return": (step, "float32"),
+        "episode_length": (step, "int32"),
+    }
+
+
+def parameter_specs(observation_size: int, action_size: int, hidden: int) -> Specs:
+    """One copy of the parameters that the workers act with."""
+    shapes = parameter_shapes(observation_size, action_size, hidden)
+    return {name: (shape, "float32") for name, shape in shapes.items()}
+
+
+class Block:
+    """The whole shared block: heartbeats, parameter buffers, and two trajectory slots per worker."""
+
+    def __init__(self, descriptor: int, num_workers: int, parameters: Specs, slot: Specs):
+        beat = {"heartbeat": ((num_workers,), "float64")}
+        self.size = size_of(beat) + NUM_BUFFERS * (size_of(parameters) + num_workers * size_of(slot))
+        self.descriptor = create(self.size) if descriptor < 0 else descriptor
+        self._memory = mmap.mmap(self.descriptor, self.size)
+        self.heartbeat = views(self._memory, beat, 0)["heartbeat"]
+        offset = size_of(beat)
+        self.parameters: list[Parameters] = []
+        for _ in range(NUM_BUFFERS):
+            self.parameters.append(views(self._memory, parameters, offset))
+            offset += size_of(parameters)
+        self.slots: list[list[dict[str, np.ndarray]]] = []  # [buffer][worker]
+        for _ in range(NUM_BUFFERS):
+            row = []
+            for _ in range(num_workers):
+                row.append(views(self._memory, slot, offset))
+                offset += size_of(slot)
+            self.slots.append(row)
+
+    def close(self) -> None:
+        """Lets go of the memory; the arrays must not be used afterwards."""
+        self.heartbeat, self.parameters, self.slots = np.empty(0), [], []
+        self._memory.close()
+        os.close(self.descriptor)
+
+
+def open_block(config: Config, plan: Plan, observation_size: int, action_size: int, descriptor: int = -1) -> Block:
+    """The block of a run: a new one, or the one behind an inherited `descriptor`."""
+    unrolls = config.collect.mode == "unrolls"
+    num_segments = plan.steps_per_worker // (plan.max_length if unrolls else 1)
+    slot = slot_specs(plan.steps_per_worker, num_segments, observation_size, action_size, plan.carry_shape)
+    parameters = parameter_specs(observation_size, action_size, config.network.hidden_size)
+    return Block(descriptor, plan.num_workers, parameters, slot)

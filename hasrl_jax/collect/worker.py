@@ -1,0 +1,224 @@
+"""A worker process: environments, policy and trajectory buffer on one CPU core.
+
+Started by the pool as `python -m hasrl_jax.collect.worker CONNECTION BLOCK`, two inherited file
+descriptors. It imports NumPy and MuJoCo but not JAX, obeys the messages of the pool, and ends when the
+pool does.
+"""
+
+import ctypes
+import io
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from multiprocessing.connection import Connection
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hasrl_jax import config as config_module
+from hasrl_jax.collect import numpy_policy, shared_memory
+from hasrl_jax.collect.plan import Plan, make_plan
+from hasrl_jax.config import Config
+from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import Mirror, Task
+
+PR_SET_PDEATHSIG = 1
+
+
+class Actor:
+    """The environments of one worker and what they carry from one iteration to the next."""
+
+    def __init__(self, config: Config, plan: Plan, index: int):
+        self.config, self.plan, self.index = config, plan, index
+        self.task: Task = make_task(config)
+        self.mirror: Mirror | None = self.task.mirror if config.network.symmetric else None
+        self.envs = CpuEnvs(self.task, plan.envs_per_worker, config.collect.max_episode_steps)
+        self.state: EnvState | None = None
+        self.carry = np.zeros((plan.envs_per_worker, *plan.carry_shape), np.float32)
+
+    def collect(self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], version: int, beat: Any) -> dict:
+        """Fills `slot` with `steps_per_env` steps of every environment; returns statistics.
+
+        Steps are stored by environment, then time: index = env * steps_per_env + t.
+
+        Args:
+          parameters: version `version` of the policy and value parameters.
+          slot: arrays of `shared_memory.slot_specs`.
+          version: also selects the random stream, so a resumed run draws the same numbers.
+          beat: called once per environment step.
+        """
+        num_envs, horizon = self.plan.envs_per_worker, self.plan.steps_per_env
+        rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.index], counter=[0, 0, 0, version]))
+        if self.state is None or self.config.collect.mode == "episodes":
+            self.state = self.envs.reset(rng)
+        by_env = {
+            name: array.reshape(num_envs, horizon, *array.shape[1:])
+            for name, array in slot.items()
+            if name not in ("initial_carry", "start", "end", "num_segments")
+        }
+        unroll_carries = []
+        sums = {"reward_terms": np.zeros(len(self.task.reward_terms)), "diverged": 0}
+        for t in range(horizon):
+            if t % self.plan.max_length == 0:
+                unroll_carries.append(np.where(self.state.is_first[:, None, None, None], np.float32(0), self.carry))
+            self._step(parameters, by_env, t, rng, sums)
+            beat()
+        self._close_buffer(parameters, by_env)
+        self._index_segments(slot, by_env, unroll_carries)
+        valid = max(int(by_env["mask"].sum()), 1)
+        terms = dict(zip(self.task.reward_terms, (sums["reward_terms"] / valid).tolist(), strict=True))
+        return {"reward_terms": terms, "diverged": int(sums["diverged"])}
+
+    def _step(self, parameters: numpy_policy.Parameters, by_env: dict, t: int, rng: np.random.Generator, sums: dict) -> None:
+        """One environment step of every environment, written to column `t`."""
+        state = self.state
+        inputs = numpy_policy.streams(state.observation, parameters, self.mirror)
+        mean, self.carry = numpy_policy.policy_step(parameters, inputs, self.carry, state.is_first, self.mirror)
+        log_std = numpy_policy.log_std(parameters, self.mirror)
+        noise = rng.standard_normal(mean.shape, np.float32)
+        action = mean + np.exp(log_std) * noise
+        by_env["observation"][:, t] = state.observation
+        by_env["is_first"][:, t] = state.is_first
+        by_env["action"][:, t] = action
+        by_env["log_prob"][:, t] = numpy_policy.log_prob(noise, log_std)
+        by_env["value"][:, t] = numpy_policy.value(parameters, inputs)
+        returns_before, steps_before = state.episode_return, state.episode_step
+        self.state, result = self.envs.step(state, action, rng)
+
+        valid = ~result.diverged
+        by_env["reward"][:, t] = np.where(valid, result.reward, 0.0)
+        by_env["terminated"][:, t] = result.terminated
+        by_env["truncated"][:, t] = result.truncated
+        by_env["mask"][:, t] = valid
+        by_env["bootstrap_value"][:, t] = 0.0
+        if t and result.diverged.any():  # the step before a lost one bootstraps from the state where it led
+            lost = result.diverged & by_env["mask"][:, t - 1] & ~state.is_first
+            by_env["truncated"][lost, t - 1] = True
+            by_env["bootstrap_value"][lost, t - 1] = by_env["value"][lost, t]
+        if result.truncated.any():
+            cut = np.flatnonzero(result.truncated)
+            final = numpy_policy.streams(result.final_observation[cut], parameters, self.mirror)
+            by_env["bootstrap_value"][cut, t] = numpy_policy.value(parameters, final)
+        ended = result.terminated | result.truncated
+        by_env["episode_return"][:, t] = np.where(ended, returns_before + result.reward, 0.0)
+        by_env["episode_length"][:, t] = np.where(ended, steps_before + 1, 0)
+        sums["reward_terms"] += result.reward_terms[valid].sum(axis=0)
+        sums["diverged"] += int(result.diverged.sum())
+
+    def _close_buffer(self, parameters: numpy_policy.Parameters, by_env: dict) -> None:
+        """Cuts what the buffer's end cuts: the last step of every trajectory bootstraps from what follows it."""
+        horizon, unroll = self.plan.steps_per_env, self.plan.max_length
+        in_unrolls = self.config.collect.mode == "unrolls"
+        last = np.arange(unroll - 1, horizon, unroll) if in_unrolls else np.array([horizon - 1])
+        inputs = numpy_policy.streams(self.state.observation, parameters, self.mirror)
+        following = np.concatenate([by_env["value"][:, last[:-1] + 1], numpy_policy.value(parameters, inputs)[:, None]], axis=1)
+        cut = ~by_env["terminated"][:, last] & ~by_env["truncated"][:, last] & by_env["mask"][:, last]
+        by_env["truncated"][:, last] |= cut
+        by_env["bootstrap_value"][:, last] = np.where(cut, following, by_env["bootstrap_value"][:, last])
+
+    def _index_segments(self, slot: dict, by_env: dict, unroll_carries: list[np.ndarray]) -> None:
+        """Writes the start and end index of each trajectory in the flat buffer, and the carry it starts from."""
+        num_envs, horizon, unroll = self.plan.envs_per_worker, self.plan.steps_per_env, self.plan.max_length
+        if self.config.collect.mode == "unrolls":
+            start = np.arange(0, num_envs * horizon, unroll)
+            end = start + unroll
+            slot["initial_carry"][:] = np.stack(unroll_carries, axis=1).reshape(len(start), *self.plan.carry_shape)
+        else:
+            cut = by_env["terminated"] | by_env["truncated"] | ~by_env["mask"]
+            cut[:, -1] = True
+            end = np.flatnonzero(cut.reshape(-1)) + 1
+            start = np.concatenate([[0], end[:-1]])
+            slot["initial_carry"][: len(start)] = 0.0
+        slot["start"][: len(start)] = start
+        slot["end"][: len(end)] = end
+        slot["num_segments"][0] = len(start)
+
+    def save(self) -> bytes:
+        """Everything the environments carry, as an .npz archive; empty before the first collection."""
+        if self.state is None:
+            return b""
+        state = self.state
+        arrays = {name: getattr(state, name) for name in state._fields if name not in ("task", "model_fields")}
+        arrays |= {f"task/{name}": array for name, array in state.task._asdict().items()}
+        arrays |= {f"model/{name}": array for name, array in state.model_fields.items()}
+        buffer = io.BytesIO()
+        np.savez(buffer, carry=self.carry, **arrays)
+        return buffer.getvalue()
+
+    def load(self, data: bytes) -> None:
+        """Restores what `save` returned."""
+        if not data:
+            return
+        arrays = dict(np.load(io.BytesIO(data), allow_pickle=False))
+        self.carry = arrays.pop("carry")
+        rng = np.random.Generator(np.random.Philox(0))
+        template = self.task.reset(rng.random((1, self.task.reset_uniforms)), np)
+        task_state = type(template.state)(**{name: arrays.pop(f"task/{name}") for name in template.state._fields})
+        fields = {name: arrays.pop(f"model/{name}") for name in template.model_fields}
+        self.state = EnvState(task=task_state, model_fields=fields, **arrays)
+        self.envs.restore(self.state)
+
+
+def serve(connection: Connection, descriptor: int) -> None:
+    """Answers the pool's messages until it says stop or goes away."""
+    setup = json.loads(connection.recv_bytes())
+    _die_with_parent(setup["parent"])
+    config = config_module.from_dict(setup["config"])
+    plan = make_plan(config)
+    index = setup["index"]
+    actor = Actor(config, plan, index)
+    block = shared_memory.open_block(config, plan, actor.task.observation_size, actor.task.action_size, descriptor)
+
+    def beat() -> None:
+        block.heartbeat[index] = time.monotonic()
+
+    beat()
+    reply(connection, {"ready": True})
+    while True:
+        message = json.loads(connection.recv_bytes())
+        beat()
+        if message["do"] == "collect":
+            version = message["version"]
+            buffer = version % shared_memory.NUM_BUFFERS
+            cpu = time.process_time()
+            statistics = actor.collect(block.parameters[buffer], block.slots[buffer][index], version, beat)
+            reply(connection, statistics | {"version": version, "cpu_seconds": time.process_time() - cpu})
+        elif message["do"] == "save":
+            connection.send_bytes(actor.save())
+        elif message["do"] == "load":
+            actor.load(connection.recv_bytes())
+            reply(connection, {"loaded": True})
+
+
+def reply(connection: Connection, message: dict) -> None:
+    connection.send_bytes(json.dumps(message).encode())
+
+
+def _die_with_parent(parent: int) -> None:
+    """Asks the kernel to end this process with the pool's, however that ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before the request
+        os._exit(0)
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the pool decides what to do
+    mujoco.set_mju_user_warning(lambda text: None)  # divergence is counted, not written to a log file
+    connection = Connection(int(sys.argv[1]))
+    try:
+        serve(connection, int(sys.argv[2]))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the pool closed the connection: the normal end
+    except Exception:
+        reply(connection, {"error": traceback.format_exc()})
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,236 @@
+"""Configuration: frozen dataclasses, strict YAML, and checks that run before anything compiles.
+
+The defaults of these classes are the project's defaults; a YAML file names only what it changes.
+Every field is read somewhere, and its comment gives its meaning and unit.
+"""
+
+import dataclasses
+import math
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+
+class ConfigError(ValueError):
+    """A configuration value that cannot work; the message names the field, the value and what would work."""
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    timestep_s: float = 0.0025  # physics step, seconds (the paper: 0.0005)
+    steps_per_env_step: int = 10  # physics steps per environment (policy) step (the paper: 50)
+    solver: Literal["Newton", "CG", "PGS"] = "Newton"  # constraint solver
+    integrator: Literal["Euler", "implicitfast"] = "implicitfast"  # implicitfast is stable at 2.5 ms
+    solver_iterations: int = 4  # constraint solver iterations, at most
+    line_search_iterations: int = 8  # line-search iterations per solver iteration, at most
+
+
+@dataclass(frozen=True)
+class CommandConfig:
+    forward_m_s: tuple[float, float] = (-0.3, 2.0)  # range of the commanded forward speed, m/s
+    lateral_m_s: tuple[float, float] = (-0.1, 0.1)  # range of the commanded lateral speed, m/s (left is positive)
+    stand_probability: float = 0.1  # share of draws that command zero speed
+    resample_s: tuple[float, float] = (2.0, 6.0)  # seconds between draws; (0, 0) keeps one draw per episode
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    cycle_s: float = 0.9  # gait cycle at zero speed, s
+    cycle_per_speed_s: float = -0.25 / 3  # change of the cycle per m/s of commanded speed, s
+    swing_fraction: float = 0.30  # share of each half cycle that is swing, at zero speed
+    swing_fraction_per_speed: float = 0.40 / 3  # change of that share per m/s
+    max_swing_fraction: float = 0.90  # upper bound of that share
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    scale: float = 2.0  # s, multiplies the sum of the weighted terms
+    foot_force: float = 0.200  # w1, weight of S_F
+    foot_velocity: float = 0.200  # w2, weight of S_V
+    orientation: float = 0.200  # w3, weight of exp(-(E_pel + E_foot))
+    pelvis_motion: float = 0.150  # w4, weight of exp(-P_m)
+    velocity: float = 0.150  # w5, weight of exp(-E_v)
+    hip_roll: float = 0.050  # w6, weight of exp(-H_p)
+    torque_change: float = 0.025  # w7, weight of exp(-T_p)
+    action_change: float = 0.025  # w8, weight of exp(-A_p)
+    velocity_sharpness: float = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
+    lateral_velocity_share: float = 1.0  # weight of the lateral speed error in E_v (the paper: 0)
+    height_m: float = 0.9  # pelvis height that P_m asks for, m
+    shaking: float = 0.25  # factor on summed |angular velocity| and |acceleration| of the pelvis in P_m
+    follow_lateral_command: bool = True  # P_m counts drift from the commanded path (the paper: from y = 0)
+
+
+@dataclass(frozen=True)
+class RandomizeConfig:
+    enabled: bool = True  # draw the model anew at each reset
+    damping_scale: tuple[float, float] = (0.3, 5.0)  # joint damping factor, per leg joint
+    mass_scale: tuple[float, float] = (0.5, 1.5)  # mass and inertia factor, per body
+    sliding_friction: tuple[float, float] = (0.4, 1.1)  # one draw for the ground
+    torsional_friction: tuple[float, float] = (1e-4, 5e-4)  # one draw for the ground, m
+    rolling_friction: tuple[float, float] = (1e-4, 2e-4)  # one draw for the ground, m
+    encoder_offset_rad: float = 0.01  # half width of the encoder offset, per joint, constant in an episode, rad
+    physics_rate_scale: tuple[float, float] = (0.6, 1.2)  # factor on the physics step, hence the policy period
+
+
+@dataclass(frozen=True)
+class TerminationConfig:
+    min_height_m: float = 0.6  # the episode ends when the pelvis is lower (the paper: 0.4)
+    max_height_m: float = 3.0  # or higher
+    max_tilt_deg: float = 45.0  # or when the pelvis tilts further from upright (the paper: no bound, 180)
+
+
+@dataclass(frozen=True)
+class CassieConfig:
+    command: CommandConfig = field(default_factory=CommandConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
+    termination: TerminationConfig = field(default_factory=TerminationConfig)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    hidden_size: int = 128  # width of each LSTM layer and of each value layer
+    initial_log_std: float = 0.0  # log of the exploration standard deviation at the start
+    learn_std: bool = True  # train the standard deviation; otherwise it stays at its start
+    normalize_observations: bool = True  # running mean and variance, part of the checkpoint
+    symmetric: bool = False  # mirror-equivariant policy and mirror-invariant value by construction
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    num_workers: int = 0  # worker processes; 0 picks one per core
+    envs_per_worker: int = 32  # environments stepped together by one worker
+    env_steps_per_iteration: int = 16384  # environment steps per iteration, all workers together
+    mode: Literal["unrolls", "episodes"] = "unrolls"  # fixed-length pieces, or whole episodes from a fresh reset
+    unroll_length: int = 64  # environment steps per trajectory in `unrolls` mode
+    max_episode_steps: int = 400  # time limit of an episode, environment steps
+    worker_start_timeout_s: float = 60.0  # a worker must report ready within this time
+    worker_timeout_s: float = 20.0  # a worker silent for this long while collecting is replaced
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    epochs: int = 5  # passes over the data of an iteration
+    minibatch_trajectories: int = 64  # trajectories per minibatch
+    policy_learning_rate: float = 3e-4  # Adam step size of the policy
+    value_learning_rate: float = 1e-3  # Adam step size of the value network
+    learning_rate_schedule: Literal["constant", "linear"] = "constant"  # linear goes to zero at total_env_steps
+    adam_epsilon: float = 1e-5  # Adam epsilon
+    max_gradient_norm: float = 0.5  # global-norm clip, each network on its own
+    clip: float = 0.2  # epsilon of the clipped surrogate
+    entropy_coefficient: float = 0.0  # c1
+    value_coefficient: float = 1.0  # c2
+    discount: float = 0.97  # gamma
+    advantage: Literal["gae", "return"] = "gae"  # GAE, or discounted return minus value (paper Eq. 2)
+    gae_lambda: float = 0.95  # lambda of GAE
+    standardize_advantages: bool = True  # zero mean, unit deviation over the iteration
+    max_kl: float = 0.03  # skip the rest of the policy updates of an iteration beyond this KL; 0 never skips
+    mask_padding: bool = True  # False copies the published losses, which average over padding
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    every_iterations: int = 20  # evaluate the mean action every this many iterations; 0 never
+    episodes: int = 16  # episodes per evaluation
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    every_iterations: int = 20  # save every this many iterations (and always at the end)
+    keep: int = 3  # newest checkpoints kept
+
+
+@dataclass(frozen=True)
+class Config:
+    task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
+    backend: Literal["cpu_pool"] = "cpu_pool"  # where experience is collected
+    schedule: Literal["sync", "overlap"] = "sync"  # collect then train, or collect while training
+    seed: int = 0  # seeds every random stream
+    total_env_steps: int = 50_000_000  # training ends after this many environment steps
+    run_dir: str = ""  # where the run is written; empty makes runs/<task>-<time>
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    cassie: CassieConfig = field(default_factory=CassieConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The configuration as plain dicts, lists and scalars, ready for YAML or JSON."""
+    return {
+        f.name: to_dict(value) if dataclasses.is_dataclass(value) else list(value) if isinstance(value, tuple) else value
+        for f in dataclasses.fields(config)
+        for value in [getattr(config, f.name)]
+    }
+
+
+def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
+    """`base` (default: `Config()`) with the fields named in `values` replaced.
+
+    Raises:
+      ConfigError: an unknown key or a value of another type; the message names the dotted path.
+    """
+    base = Config() if base is None else base
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: expected a mapping of fields, got {values!r}")
+    hints = typing.get_type_hints(type(base))
+    changes = {}
+    for key, value in values.items():
+        path = f"{where}.{key}"
+        if key not in hints:
+            raise ConfigError(f"{path}: unknown field; known fields are {', '.join(hints)}")
+        current = getattr(base, key)
+        changes[key] = from_dict(value, current, path) if dataclasses.is_dataclass(current) else _convert(value, hints[key], path)
+    return dataclasses.replace(base, **changes)
+
+
+def _convert(value: Any, hint: Any, path: str) -> Any:
+    """`value` as the annotated type `hint`, or a ConfigError naming `path`."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        if value in args:
+            return value
+        raise ConfigError(f"{path}: got {value!r}; expected one of {', '.join(map(repr, args))}")
+    if origin is tuple:
+        if isinstance(value, list | tuple) and len(value) == len(args):
+            return tuple(_convert(v, a, f"{path}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
+        raise ConfigError(f"{path}: got {value!r}; expected a list of {len(args)} numbers")
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
+        try:
+            value = float(value)
+        except ValueError:
+            pass
+    accepted = {float: (int, float), int: int, bool: bool, str: str}[hint]
+    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{path}: got {value!r}; expected {hint.__name__}")
+    if hint is float and not math.isfinite(value):
+        raise ConfigError(f"{path}: got {value!r}; expected a finite number")
+    return hint(value)
+
+
+def load_yaml(path: str | Path) -> Config:
+    """Reads a YAML file over the defaults.
+
+    Raises:
+      ConfigError: missing or unreadable file, invalid YAML, unknown or impossible values.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--config {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--config {path}: not valid YAML ({' '.join(str(error).split())})") from None
+    return from_dict(values or {}, where=Path(path).name)
+
+
+def dump_yaml(config: Config) -> str:
+    """The resolved configuration as YAML text."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False)

@@ -1,0 +1,177 @@
+"""Many environments stepped together by C MuJoCo in one call; the engine behind the CPU pool.
+
+Every number that describes the environments is an array in `EnvState`, so saving and restoring them
+is copying arrays. Randomness comes in as a NumPy generator; the environments hold none.
+"""
+
+import copy
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from hasrl_jax.envs.task import Reading, Task
+
+PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
+
+
+class EnvState(NamedTuple):
+    """The complete state of E environments."""
+
+    physics: np.ndarray  # [E, nstate] float64: time, qpos, qvel (mjSTATE_FULLPHYSICS)
+    task: Any  # the task's NamedTuple of arrays [E, ...]
+    model_fields: dict[str, np.ndarray]  # randomised MjModel fields [E, ...]
+    observation: np.ndarray  # [E, O] the observation that the policy sees next
+    is_first: np.ndarray  # [E] bool: that observation opens an episode
+    episode_step: np.ndarray  # [E] int64 environment steps since reset
+    episode_return: np.ndarray  # [E] sum of rewards since reset
+
+
+class StepResult(NamedTuple):
+    """What one environment step of E environments produced."""
+
+    reward: np.ndarray  # [E]
+    terminated: np.ndarray  # [E] bool
+    truncated: np.ndarray  # [E] bool: the time limit
+    diverged: np.ndarray  # [E] bool: the simulation failed; nothing of this step is valid
+    final_observation: np.ndarray  # [E, O] the true next observation, also where a new episode begins
+    reward_terms: np.ndarray  # [E, R]
+    measures: np.ndarray  # [E, M]
+
+
+class CpuEnvs:
+    """E copies of a task, each with a model of its own so that every episode can randomise it.
+
+    Args:
+      task: the definition to run.
+      num_envs: E.
+      max_episode_steps: time limit in environment steps.
+    """
+
+    def __init__(self, task: Task, num_envs: int, max_episode_steps: int):
+        self.task = task
+        self.max_episode_steps = max_episode_steps
+        self.num_envs = num_envs
+        self._models = [copy.copy(task.model) for _ in range(num_envs)]
+        self._data = mujoco.MjData(task.model)
+        self._rollout = rollout.Rollout(nthread=0)  # on the calling thread: one core per worker
+        size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
+        self._states = np.empty((num_envs, task.steps_per_env_step, size))
+        self._sensordata = np.empty((num_envs, task.steps_per_env_step, task.model.nsensordata))
+        self._controls = np.empty((num_envs, task.steps_per_env_step, task.model.nu))
+
+    def reset(self, rng: np.random.Generator) -> EnvState:
+        """Fresh episodes in all environments."""
+        fresh = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
+        state = EnvState(
+            physics=np.concatenate([np.zeros((self.num_envs, 1)), fresh.qpos, fresh.qvel], axis=1),
+            task=fresh.state,
+            model_fields=fresh.model_fields,
+            observation=fresh.observation,
+            is_first=np.ones(self.num_envs, bool),
+            episode_step=np.zeros(self.num_envs, np.int64),
+            episode_return=np.zeros(self.num_envs),
+        )
+        self.restore(state)
+        return state
+
+    def restore(self, state: EnvState) -> None:
+        """Writes the randomised fields of `state` into the models, as `step` expects to find them."""
+        for env, model in enumerate(self._models):
+            _write_fields(model, {name: values[env] for name, values in state.model_fields.items()})
+
+    def step(self, state: EnvState, action: np.ndarray, rng: np.random.Generator) -> tuple[EnvState, StepResult]:
+        """One environment step; environments whose episode ended are reset.
+
+        Args:
+          state: as returned by `reset` or by the previous `step`.
+          action: [E, A].
+          rng: source of the uniform numbers that the task consumes.
+
+        Raises:
+          FloatingPointError: an action is not finite.
+        """
+        if not np.isfinite(action).all():
+            raise FloatingPointError("the policy produced an action that is not finite")
+        task = self.task
+        reading, diverged = self._simulate(state, task.control(state.task, action, np))
+        result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)
+        episode_step = state.episode_step + 1
+        terminated = result.terminated & ~diverged
+        truncated = (episode_step >= self.max_episode_steps) & ~terminated & ~diverged
+        step_result = StepResult(
+            result.reward, terminated, truncated, diverged, result.observation, result.reward_terms, result.measures
+        )
+        state = EnvState(
+            physics=self._states[:, -1].copy(),
+            task=result.state,
+            model_fields=state.model_fields,
+            observation=result.observation,
+            is_first=np.zeros(self.num_envs, bool),
+            episode_step=episode_step,
+            episode_return=state.episode_return + result.reward,
+        )
+        ended = np.flatnonzero(terminated | truncated | diverged)
+        return (self._reset_some(state, ended, rng) if len(ended) else state), step_result
+
+    def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[Reading, np.ndarray]:
+        """Runs the physics steps of one environment step; also says which simulations diverged, [E] bool."""
+        task, model = self.task, self.task.model
+        self._controls[:] = control[:, None]
+        self._rollout.rollout(
+            self._models,
+            [self._data],
+            state.physics,
+            self._controls,
+            control_spec=CONTROL,
+            skip_checks=True,
+            nstep=task.steps_per_env_step,
+            state=self._states,
+            sensordata=self._sensordata,
+        )
+        end = self._states[:, -1]
+        # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
+        timestep = state.model_fields.get("timestep", model.opt.timestep)
+        elapsed = end[:, 0] - state.physics[:, 0]
+        on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
+        diverged = ~(on_time & np.isfinite(end).all(axis=1) & np.isfinite(self._sensordata[:, -1]).all(axis=1))
+        reading = Reading(
+            qpos=end[:, 1 : 1 + model.nq],
+            qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
+            sensordata=self._sensordata[:, -1],
+            averages=task.physics_features(self._sensordata, np).mean(axis=1),
+        )
+        return reading, diverged
+
+    def _reset_some(self, state: EnvState, envs: np.ndarray, rng: np.random.Generator) -> EnvState:
+        """`state` with fresh episodes in the environments numbered `envs`."""
+        fresh = self.task.reset(rng.random((len(envs), self.task.reset_uniforms)), np)
+        physics = np.concatenate([np.zeros((len(envs), 1)), fresh.qpos, fresh.qvel], axis=1)
+        state = EnvState(
+            physics=_put(state.physics, envs, physics),
+            task=type(state.task)(*(_put(old, envs, new) for old, new in zip(state.task, fresh.state, strict=True))),
+            model_fields={name: _put(old, envs, fresh.model_fields[name]) for name, old in state.model_fields.items()},
+            observation=_put(state.observation, envs, fresh.observation),
+            is_first=_put(state.is_first, envs, True),
+            episode_step=_put(state.episode_step, envs, 0),
+            episode_return=_put(state.episode_return, envs, 0.0),
+        )
+        for row, env in enumerate(envs):
+            _write_fields(self._models[env], {name: values[row] for name, values in fresh.model_fields.items()})
+        return state
+
+
+def _put(values: np.ndarray, where: np.ndarray, new: Any) -> np.ndarray:
+    values = values.copy()
+    values[where] = new
+    return values
+
+
+def _write_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
+    for name, value in fields.items():
+        if name == "timestep":
+            model.opt.timestep = value
+        else:
+            getattr(model, name)[:] = value

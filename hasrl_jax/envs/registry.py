@@ -1,0 +1,14 @@
+"""The tasks by name. A new task is a module with `make(config) -> Task` and one line here."""
+
+from collections.abc import Callable
+
+from hasrl_jax.config import Config
+from hasrl_jax.envs import cartpole, cassie
+from hasrl_jax.envs.task import Task
+
+TASKS: dict[str, Callable[[Config], Task]] = {"cassie": cassie.make, "cartpole": cartpole.make}
+
+
+def make_task(config: Config) -> Task:
+    """The task that `config.task` names."""
+    return TASKS[config.task](config)

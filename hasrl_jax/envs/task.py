@@ -1,0 +1,79 @@
+"""What a task is: pure functions over arrays that both physics engines call.
+
+A task never steps physics. An engine (`cpu_env` or `mjx_env`) does, and asks the task what to
+apply, what to average over the physics steps, and what it all means. Every function takes `xp`,
+the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, written `...` below.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from hasrl_jax.types import Array
+
+
+class Reading(NamedTuple):
+    """What the physics engine reports after one environment step."""
+
+    qpos: Array  # [..., nq] positions after the last physics step
+    qvel: Array  # [..., nv] velocities after the last physics step
+    sensordata: Array  # [..., nsensordata] sensors of the last physics step
+    averages: Array  # [..., F] mean over the physics steps of `Task.physics_features`
+
+
+class Reset(NamedTuple):
+    """A fresh episode."""
+
+    state: Any  # the task's own NamedTuple of arrays [..., *]
+    observation: Array  # [..., O]
+    qpos: Array  # [..., nq]
+    qvel: Array  # [..., nv]
+    model_fields: dict[str, Array]  # MjModel field name -> its randomised value [..., *field shape]
+
+
+class Transition(NamedTuple):
+    """The outcome of one environment step."""
+
+    state: Any
+    observation: Array  # [..., O]
+    reward: Array  # [...]
+    terminated: Array  # [...] bool
+    reward_terms: Array  # [..., R] weighted terms in the order of `Task.reward_terms`, summing to the reward
+    measures: Array  # [..., M] what evaluation reports, in the order of `Task.measures`
+
+
+class Mirror(NamedTuple):
+    """The left-right mirror image of observations and actions: M x = sign * x[index]."""
+
+    observation_index: np.ndarray  # [O] int
+    observation_sign: np.ndarray  # [O]
+    action_index: np.ndarray  # [A] int
+    action_sign: np.ndarray  # [A]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task: its model, sizes and functions."""
+
+    name: str
+    model: mujoco.MjModel
+    steps_per_env_step: int  # physics steps per environment step
+    observation_size: int
+    action_size: int
+    reset_uniforms: int  # uniform [0, 1) numbers that `reset` consumes
+    step_uniforms: int  # uniform [0, 1) numbers that `step` consumes
+    reward_terms: tuple[str, ...]
+    measures: tuple[str, ...]
+    mirror: Mirror | None
+    reset: Callable[[Array, Any], Reset]  # (uniforms [..., reset_uniforms], xp)
+    control: Callable[[Any, Array, Any], Array]  # (state, action [..., A], xp) -> ctrl [..., nu]
+    physics_features: Callable[[Array, Any], Array]  # (sensordata [..., ns], xp) -> [..., F]
+    step: Callable[[Any, Array, Reading, Array, Any], Transition]  # (state, action, reading, uniforms, xp)
+
+    @property
+    def env_step_s(self) -> float:
+        """Nominal duration of one environment step, seconds."""
+        return self.model.opt.timestep * self.steps_per_env_step

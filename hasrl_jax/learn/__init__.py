@@ -1,0 +1,1 @@
+"""The learner: networks, returns, batching and the PPO step."""

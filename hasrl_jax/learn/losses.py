@@ -1,0 +1,78 @@
+"""The two PPO losses, averaged over valid steps (paper II.E)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hasrl_jax.config import PPOConfig
+from hasrl_jax.learn import distributions, returns
+from hasrl_jax.learn.networks import Policy, Value
+from hasrl_jax.types import Trajectory
+
+Parameters = dict[str, jax.Array]
+Metrics = dict[str, jax.Array]
+
+_MAX_LOG_RATIO = 20.0  # exp stays finite in float32
+
+
+class Batch(NamedTuple):
+    """What the losses read; leading axis B (an iteration) or a minibatch of it."""
+
+    trajectory: Trajectory
+    advantage: jax.Array  # [B, T]
+    target: jax.Array  # [B, T]
+    weight: jax.Array  # [B, T] bool, steps that the losses average over
+
+
+def policy_loss(
+    params: Parameters, policy: Policy, batch: Batch, mean: jax.Array, std: jax.Array, ppo: PPOConfig
+) -> tuple[jax.Array, Metrics]:
+    """Clipped surrogate and entropy bonus.
+
+        ratio_t = exp(log pi(a_t | s_t) - behaviour log-prob)
+        loss = -E_t[min(ratio_t A_t, clip(ratio_t, 1 - clip, 1 + clip) A_t)] - c1 H
+
+    E_t averages over `batch.weight`; the approximate KL, E[(ratio - 1) - log ratio], and the clip fraction always
+    average over valid steps only.
+
+    Args:
+      params: policy parameters.
+      policy: the network.
+      batch: a minibatch.
+      mean: [O] normaliser mean the collectors used.
+      std: [O] normaliser deviation.
+      ppo: coefficients.
+
+    Returns:
+      (loss, scalar metrics).
+
+    Source: paper II.E (actor loss); Schulman et al. (2017).
+    """
+    steps = batch.trajectory
+    action_mean, _ = policy.apply(
+        {"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std
+    )
+    log_std = policy.apply({"params": params}, method=Policy.log_std)
+    log_ratio = distributions.log_prob(steps.action, action_mean, log_std) - steps.log_prob
+    log_ratio = jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
+    surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
+    entropy = distributions.entropy(log_std)
+    loss = -returns.masked_mean(surrogate, batch.weight) - ppo.entropy_coefficient * entropy
+    return loss, {
+        "actor_loss": loss,
+        "entropy": entropy,
+        "ratio_mean": returns.masked_mean(ratio, batch.weight),
+        "approx_kl": returns.masked_mean((ratio - 1.0) - log_ratio, steps.mask),
+        "clip_fraction": returns.masked_mean((jnp.abs(ratio - 1.0) > ppo.clip).astype(jnp.float32), steps.mask),
+    }
+
+
+def value_loss(
+    params: Parameters, value: Value, batch: Batch, mean: jax.Array, std: jax.Array, ppo: PPOConfig
+) -> jax.Array:
+    """c2 E_t[(V(s_t) - R_t)^2] / 2; arguments as in `policy_loss`. Source: paper II.E (critic loss)."""
+    prediction = value.apply({"params": params}, batch.trajectory.observation, mean, std)
+    return ppo.value_coefficient * 0.5 * returns.masked_mean(jnp.square(prediction - batch.target), batch.weight)

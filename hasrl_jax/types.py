@@ -1,0 +1,43 @@
+"""The arrays that cross between collectors and the learner.
+
+Legend of shapes, used in every docstring:
+
+    N   transitions in a flat buffer          B   trajectories in a batch
+    T   environment steps in a trajectory     E   environments in one worker
+    O   observation size (50 for Cassie)      A   action size (10 for Cassie)
+    L   LSTM layers (2)                       H   hidden width
+
+All arrays are float32 unless stated. NamedTuples are used instead of flax.struct so that worker
+processes, which never import JAX, share these definitions; JAX treats both as pytrees.
+"""
+
+from typing import Any, NamedTuple
+
+Array = Any  # numpy.ndarray or jax.Array: the definition code runs on both
+
+
+class Trajectory(NamedTuple):
+    """A batch of trajectories, padded on the right; every array is [B, T] unless stated.
+
+    Step t holds s_t, a_t, r_t and what was known when a_t was chosen. Episodes may begin inside a
+    trajectory: `is_first` marks those steps and the LSTM carry is reset there.
+
+    The value that follows step t, needed for returns, is
+        0                    where `terminated` (the MDP ended at t),
+        bootstrap_value[t]   where `truncated` (cut from outside at t: time limit or end of the buffer),
+        value[t + 1]         elsewhere.
+    The last valid step of a trajectory is always terminated or truncated.
+    """
+
+    observation: Array  # [B, T, O] raw (not normalised)
+    action: Array  # [B, T, A] as sampled, before any clipping inside the environment
+    log_prob: Array  # behaviour log-probability of `action`
+    value: Array  # V(s_t) of the behaviour version
+    reward: Array
+    is_first: Array  # bool: the first step of an episode
+    terminated: Array  # bool: the MDP ended after this step
+    truncated: Array  # bool: cut from outside after this step
+    bootstrap_value: Array  # V(s_{t+1}) of the true next observation where `truncated`, else 0
+    mask: Array  # bool: False on padding and on steps of a diverged simulation
+    initial_carry: Array  # [B, L, 2, H] LSTM (h, c) before step 0
+    policy_version: Array  # [B] int32, version of the parameters that acted
