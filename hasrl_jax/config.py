@@ -1,17 +1,33 @@
 """Configuration: frozen dataclasses, strict YAML, and checks that run before anything compiles.
 
-The defaults of these classes are the project's defaults; a YAML file names only what it changes.
-Every field is read somewhere, and its comment gives its meaning and unit.
+A YAML file names only what it changes from the defaults of these classes. Training without `--config` reads
+`configs/cassie_walk.yaml`. Every field is read somewhere, and its comment gives its meaning and unit.
 """
 
 import dataclasses
 import math
+import os
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+
+
+def available_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _default_config() -> Path:
+    """configs/cassie_walk.yaml, beside the package in a checkout and inside it in a wheel."""
+    package = Path(__file__).parent
+    folders = package.parent / "configs", package / "configs"
+    return next((folder for folder in folders if folder.is_dir()), folders[0]) / "cassie_walk.yaml"
+
+
+DEFAULT_CONFIG = _default_config()
 
 
 class ConfigError(ValueError):
@@ -102,7 +118,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    num_workers: int = 0  # worker processes; 0 picks one per core
+    num_workers: int = field(default_factory=available_cores)  # worker processes; the default is one per core
     envs_per_worker: int = 32  # environments stepped together by one worker
     env_steps_per_iteration: int = 16384  # environment steps per iteration, all workers together
     mode: Literal["unrolls", "episodes"] = "unrolls"  # fixed-length pieces, or whole episodes from a fresh reset
@@ -234,3 +250,74 @@ def load_yaml(path: str | Path) -> Config:
 def dump_yaml(config: Config) -> str:
     """The resolved configuration as YAML text."""
     return yaml.safe_dump(to_dict(config), sort_keys=False)
+
+
+def check(config: Config) -> None:
+    """Rejects values that cannot work.
+
+    Raises:
+      ConfigError: names the field, the value seen and what would work.
+    """
+    collect, ppo, physics, cassie = config.collect, config.ppo, config.physics, config.cassie
+    at_least_one = {
+        "total_env_steps": config.total_env_steps,
+        "physics.steps_per_env_step": physics.steps_per_env_step,
+        "physics.solver_iterations": physics.solver_iterations,
+        "physics.line_search_iterations": physics.line_search_iterations,
+        "network.hidden_size": config.network.hidden_size,
+        "collect.num_workers": collect.num_workers,
+        "collect.envs_per_worker": collect.envs_per_worker,
+        "collect.env_steps_per_iteration": collect.env_steps_per_iteration,
+        "collect.unroll_length": collect.unroll_length,
+        "collect.max_episode_steps": collect.max_episode_steps,
+        "ppo.epochs": ppo.epochs,
+        "ppo.minibatch_trajectories": ppo.minibatch_trajectories,
+        "evaluate.episodes": config.evaluate.episodes,
+        "checkpoint.keep": config.checkpoint.keep,
+    }
+    for name, value in at_least_one.items():
+        _require(value >= 1, name, value, "at least 1")
+    positive = {
+        "collect.worker_start_timeout_s": collect.worker_start_timeout_s,
+        "collect.worker_timeout_s": collect.worker_timeout_s,
+        "ppo.policy_learning_rate": ppo.policy_learning_rate,
+        "ppo.value_learning_rate": ppo.value_learning_rate,
+        "ppo.adam_epsilon": ppo.adam_epsilon,
+        "ppo.max_gradient_norm": ppo.max_gradient_norm,
+        "ppo.value_coefficient": ppo.value_coefficient,
+        "cassie.clock.cycle_s": cassie.clock.cycle_s,
+    }
+    for name, value in positive.items():
+        _require(value > 0, name, value, "a number above 0")
+    not_negative = {
+        "seed": config.seed,
+        "ppo.max_kl": ppo.max_kl,
+        "ppo.entropy_coefficient": ppo.entropy_coefficient,
+        "evaluate.every_iterations": config.evaluate.every_iterations,
+        "checkpoint.every_iterations": config.checkpoint.every_iterations,
+        "cassie.randomize.encoder_offset_rad": cassie.randomize.encoder_offset_rad,
+    }
+    for name, value in not_negative.items():
+        _require(value >= 0, name, value, "0 or more")
+    _require(1e-5 <= physics.timestep_s <= 0.01, "physics.timestep_s", physics.timestep_s, "between 1e-5 and 0.01 s")
+    _require(0 < ppo.clip < 1, "ppo.clip", ppo.clip, "between 0 and 1")
+    _require(0 <= ppo.discount <= 1, "ppo.discount", ppo.discount, "from 0 to 1")
+    _require(0 <= ppo.gae_lambda <= 1, "ppo.gae_lambda", ppo.gae_lambda, "from 0 to 1")
+    share = cassie.command.stand_probability
+    _require(0 <= share <= 1, "cassie.command.stand_probability", share, "from 0 to 1")
+    for group in ("command", "randomize"):
+        settings = getattr(cassie, group)
+        for f in dataclasses.fields(settings):
+            value = getattr(settings, f.name)
+            if isinstance(value, tuple):
+                _require(value[0] <= value[1], f"cassie.{group}.{f.name}", value, "low <= high")
+    fastest = max(abs(speed) for speed in cassie.command.forward_m_s)
+    cycle = cassie.clock.cycle_s + cassie.clock.cycle_per_speed_s * fastest
+    _require(cycle > 0.1, "cassie.clock.cycle_per_speed_s", cassie.clock.cycle_per_speed_s, f"a gait cycle above 0.1 s at {fastest:g} m/s")
+    limits = cassie.termination
+    _require(limits.min_height_m < limits.max_height_m, "cassie.termination.min_height_m", limits.min_height_m, "less than max_height_m")
+
+
+def _require(condition: bool, name: str, value: Any, expected: str) -> None:
+    if not condition:
+        raise ConfigError(f"{name}: got {value!r}; expected {expected}")

@@ -13,6 +13,8 @@ processes, which never import JAX, share these definitions; JAX treats both as p
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 Array = Any  # numpy.ndarray or jax.Array: the definition code runs on both
 
 
@@ -41,3 +43,20 @@ class Trajectory(NamedTuple):
     mask: Array  # bool: False on padding and on steps of a diverged simulation
     initial_carry: Array  # [B, L, 2, H] LSTM (h, c) before step 0
     policy_version: Array  # [B] int32, version of the parameters that acted
+
+
+class Mirror(NamedTuple):
+    """The left-right mirror image of observations and actions as signed permutations: M x = sign * x[index]."""
+
+    observation_index: np.ndarray  # [O] int
+    observation_sign: np.ndarray  # [O] +1 or -1
+    action_index: np.ndarray  # [A] int
+    action_sign: np.ndarray  # [A] +1 or -1
+
+    def observation(self, observation: Array) -> Array:
+        """The mirrored observation, [..., O]."""
+        return observation[..., self.observation_index] * self.observation_sign
+
+    def action(self, action: Array) -> Array:
+        """The mirrored action, [..., A]."""
+        return action[..., self.action_index] * self.action_sign

@@ -1,7 +1,7 @@
 """The pool of worker processes: starts them, hands out parameters, gathers trajectories, replaces the dead.
 
 Messages are short JSON texts over one connection per worker; parameters and trajectories never pass
-through it but lie in shared memory, double-buffered by the parity of the policy version.
+through it but lie in shared memory, double-buffered by the parity of the iteration.
 Source: paper section III.A and Figure 1.
 """
 
@@ -42,7 +42,7 @@ class Collected(NamedTuple):
     start: np.ndarray  # [S] int32, re-based to the centralised buffer
     end: np.ndarray  # [S] int32
     initial_carry: np.ndarray  # [S, L, 2, W]
-    version: int
+    version: int  # of the parameters that acted
     statistics: list[dict[str, Any]]  # one per worker that finished
     seconds: float  # from the request to the last reply
 
@@ -71,7 +71,8 @@ class CpuPool:
         self._failures = [0] * plan.num_workers
         self._workers: list[_Worker | None] = [None] * plan.num_workers
         self._block = shared_memory.open_block(config, plan, task.observation_size, task.action_size)
-        self._version = -1
+        self._iteration, self._version = -1, -1
+        self.busy = False  # between `start` and `finish`
         self._started = 0.0
         try:
             for index in range(plan.num_workers):
@@ -93,15 +94,22 @@ class CpuPool:
         """Operating-system process of each worker, in worker order."""
         return [worker.process.pid for worker in self._workers if worker is not None]
 
-    def start(self, parameters: dict[str, np.ndarray], version: int) -> None:
-        """Asks every worker for one iteration with these parameters; returns at once."""
-        buffer = self._block.parameters[version % shared_memory.NUM_BUFFERS]
+    def start(self, parameters: dict[str, np.ndarray], iteration: int, version: int) -> None:
+        """Asks every worker for one iteration of steps; returns at once.
+
+        Args:
+          parameters: copied to the workers.
+          iteration: selects the random streams and, by its parity, the buffers.
+          version: of the parameters.
+        """
+        buffer = self._block.parameters[iteration % shared_memory.NUM_BUFFERS]
         for name, array in buffer.items():
             array[:] = parameters[name]
-        self._version, self._started = version, time.monotonic()
+        self._iteration, self._version, self._started = iteration, version, time.monotonic()
+        self.busy = True
         self._block.heartbeat[:] = self._started
         for index in range(self.plan.num_workers):
-            self._send(index, {"do": "collect", "version": version})
+            self._send(index, {"do": "collect", "iteration": iteration})
 
     def finish(self) -> Collected:
         """Waits for the iteration that `start` asked for and merges the workers' buffers.
@@ -125,6 +133,7 @@ class CpuPool:
                 else:
                     self._replace(index, cause or f"raised\n{message['error']}")
             pending -= self._replace_silent(pending)
+        self.busy = False
         if not statistics:
             raise WorkerError("every worker was lost in the same iteration; see the messages above")
         return self._merge(statistics)
@@ -216,7 +225,7 @@ class CpuPool:
 
     def _merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
         """Copies the slots into one buffer and shifts their start and end indices accordingly."""
-        slots = self._block.slots[self._version % shared_memory.NUM_BUFFERS]
+        slots = self._block.slots[self._iteration % shared_memory.NUM_BUFFERS]
         finished = [slots[index] for index in sorted(statistics)]
         counts = [int(slot["num_segments"][0]) for slot in finished]
         offsets = [position * self.plan.steps_per_worker for position in range(len(finished))]

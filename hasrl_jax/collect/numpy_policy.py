@@ -6,7 +6,7 @@ the time and memory of importing JAX, and a batch of a few dozen states needs no
 
 import numpy as np
 
-from hasrl_jax.envs.task import Mirror
+from hasrl_jax.types import Mirror
 
 LAYERS = 2
 Parameters = dict[str, np.ndarray]
@@ -32,7 +32,7 @@ def parameter_shapes(observation_size: int, action_size: int, hidden: int) -> di
 
 def streams(observation: np.ndarray, parameters: Parameters, mirror: Mirror | None) -> np.ndarray:
     """Normalised network inputs, [S, E, O]: the observation and, for a symmetric network, its mirror image."""
-    inputs = [observation] if mirror is None else [observation, observation[:, mirror.observation_index] * mirror.observation_sign]
+    inputs = [observation] if mirror is None else [observation, mirror.observation(observation)]
     normalized = (np.stack(inputs) - parameters["normalizer/mean"]) / parameters["normalizer/std"]
     return np.clip(normalized, -10, 10).astype(np.float32)
 
@@ -71,7 +71,7 @@ def policy_step(
         following[layer, 1] = c.reshape(num_streams, num_envs, width)
         x = np.tanh(h)
     head = (x @ parameters["policy/mean_kernel"] + parameters["policy/mean_bias"]).reshape(num_streams, num_envs, -1)
-    mean = head[0] if mirror is None else 0.5 * (head[0] + head[1][:, mirror.action_index] * mirror.action_sign)
+    mean = head[0] if mirror is None else 0.5 * (head[0] + mirror.action(head[1]))
     return np.tanh(mean, dtype=np.float32), following.transpose(3, 0, 1, 2, 4).reshape(carry.shape)
 
 

@@ -1,6 +1,5 @@
 """How an iteration's budget of environment steps is divided among workers, environments and trajectories."""
 
-import os
 from typing import NamedTuple
 
 from hasrl_jax.config import Config
@@ -26,15 +25,10 @@ class Plan(NamedTuple):
         return self.num_workers * self.steps_per_worker
 
 
-def available_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def make_plan(config: Config) -> Plan:
     """Rounds the budget up so that every environment collects the same number of steps."""
     collect = config.collect
-    num_workers = collect.num_workers or available_cores()
+    num_workers = collect.num_workers
     num_envs = num_workers * collect.envs_per_worker
     steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
     minibatch = config.ppo.minibatch_trajectories

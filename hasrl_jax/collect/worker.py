@@ -25,7 +25,8 @@ from hasrl_jax.collect.plan import Plan, make_plan
 from hasrl_jax.config import Config
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.envs.task import Mirror, Task
+from hasrl_jax.envs.task import Task
+from hasrl_jax.types import Mirror
 
 PR_SET_PDEATHSIG = 1
 
@@ -41,19 +42,19 @@ class Actor:
         self.state: EnvState | None = None
         self.carry = np.zeros((plan.envs_per_worker, *plan.carry_shape), np.float32)
 
-    def collect(self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], version: int, beat: Any) -> dict:
+    def collect(self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], iteration: int, beat: Any) -> dict:
         """Fills `slot` with `steps_per_env` steps of every environment; returns statistics.
 
         Steps are stored by environment, then time: index = env * steps_per_env + t.
 
         Args:
-          parameters: version `version` of the policy and value parameters.
+          parameters: the policy and value parameters to act with.
           slot: arrays of `shared_memory.slot_specs`.
-          version: also selects the random stream, so a resumed run draws the same numbers.
+          iteration: selects the random stream, so a resumed run draws the same numbers.
           beat: called once per environment step.
         """
         num_envs, horizon = self.plan.envs_per_worker, self.plan.steps_per_env
-        rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.index], counter=[0, 0, 0, version]))
+        rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.index], counter=[0, 0, 0, iteration]))
         if self.state is None or self.config.collect.mode == "episodes":
             self.state = self.envs.reset(rng)
         by_env = {
@@ -183,11 +184,11 @@ def serve(connection: Connection, descriptor: int) -> None:
         message = json.loads(connection.recv_bytes())
         beat()
         if message["do"] == "collect":
-            version = message["version"]
-            buffer = version % shared_memory.NUM_BUFFERS
+            iteration = message["iteration"]
+            buffer = iteration % shared_memory.NUM_BUFFERS
             cpu = time.process_time()
-            statistics = actor.collect(block.parameters[buffer], block.slots[buffer][index], version, beat)
-            reply(connection, statistics | {"version": version, "cpu_seconds": time.process_time() - cpu})
+            statistics = actor.collect(block.parameters[buffer], block.slots[buffer][index], iteration, beat)
+            reply(connection, statistics | {"cpu_seconds": time.process_time() - cpu})
         elif message["do"] == "save":
             connection.send_bytes(actor.save())
         elif message["do"] == "load":

@@ -11,8 +11,8 @@ import numpy as np
 from hasrl_jax.config import Config
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.randomize import between
-from hasrl_jax.envs.task import Mirror, Reading, Reset, Task, Transition
-from hasrl_jax.types import Array
+from hasrl_jax.envs.task import Reading, Reset, Task, Transition
+from hasrl_jax.types import Array, Mirror
 
 MAX_ANGLE_RAD = 0.2
 MAX_POSITION_M = 1.0
@@ -37,7 +37,7 @@ def make(config: Config) -> Task:
         step_uniforms=0,
         reward_terms=("upright",),
         measures=("angle",),
-        mirror=Mirror(np.arange(2), -np.ones(2), np.arange(1), -np.ones(1)),
+        mirror=Mirror(np.arange(2), -np.ones(2, np.float32), np.arange(1), -np.ones(1, np.float32)),
         reset=reset,
         control=control,
         physics_features=physics_features,

@@ -11,8 +11,8 @@ import numpy as np
 from hasrl_jax.config import CassieConfig, Config
 from hasrl_jax.envs import clock, randomize, rewards
 from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, load_model
-from hasrl_jax.envs.task import Mirror, Reading, Reset, Task, Transition
-from hasrl_jax.types import Array
+from hasrl_jax.envs.task import Reading, Reset, Task, Transition
+from hasrl_jax.types import Array, Mirror
 
 OBSERVATION_SIZE = 50
 ACTION_SIZE = 10
@@ -235,4 +235,5 @@ def mirror() -> Mirror:
     vector, axial = [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]  # how mirroring acts on positions and on rotations
     sign = [1.0, 1.0, *axial, *motor_sign, *vector, *axial, *motor_sign, *vector, *passive_sign, *passive_sign]
     sign += [-1.0, -1.0, 1.0, -1.0]  # clock sin, cos; forward and lateral command
-    return Mirror(np.array(index), np.array(sign), np.array(swap(0, motors)), np.array(motor_sign))
+    signs = np.array(sign, np.float32), np.array(motor_sign, np.float32)
+    return Mirror(np.array(index), signs[0], np.array(swap(0, motors)), signs[1])

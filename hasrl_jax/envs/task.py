@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import mujoco
-import numpy as np
 
-from hasrl_jax.types import Array
+from hasrl_jax.types import Array, Mirror
 
 
 class Reading(NamedTuple):
@@ -43,15 +42,6 @@ class Transition(NamedTuple):
     terminated: Array  # [...] bool
     reward_terms: Array  # [..., R] weighted terms in the order of `Task.reward_terms`, summing to the reward
     measures: Array  # [..., M] what evaluation reports, in the order of `Task.measures`
-
-
-class Mirror(NamedTuple):
-    """The left-right mirror image of observations and actions: M x = sign * x[index]."""
-
-    observation_index: np.ndarray  # [O] int
-    observation_sign: np.ndarray  # [O]
-    action_index: np.ndarray  # [A] int
-    action_sign: np.ndarray  # [A]
 
 
 @dataclass(frozen=True)

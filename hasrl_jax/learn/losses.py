@@ -50,9 +50,7 @@ def policy_loss(
     Source: paper II.E (actor loss); Schulman et al. (2017).
     """
     steps = batch.trajectory
-    action_mean, _ = policy.apply(
-        {"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std
-    )
+    action_mean, _ = policy.apply({"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std)
     log_std = policy.apply({"params": params}, method=Policy.log_std)
     log_ratio = distributions.log_prob(steps.action, action_mean, log_std) - steps.log_prob
     log_ratio = jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)

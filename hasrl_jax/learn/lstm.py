@@ -6,11 +6,14 @@ Automatic differentiation would instead add to the [H, 4H] gradient at every ste
 again on a CPU and, with a batch split over devices, one all-reduce per step.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 GATES = 4  # input i, forget f, candidate g, output o: the order along the last axis of every 4H array
-SCAN_UNROLL = 4  # environment steps per loop body; more compiles longer and runs no faster
+
+Pair = tuple[jax.Array, jax.Array]
 
 
 def lstm_layer(
@@ -46,9 +49,14 @@ def lstm_layer(
     return _recurrence(projected, recurrent_kernel, hidden, cell, keep)
 
 
-def _activate(gates: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def _cell(
+    gates: jax.Array, cell: jax.Array
+) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array, jax.Array, jax.Array]]:
+    """(h, c, activated gates), each [B, H], from gates [B, 4H] before activation and the cell before the step."""
     i, f, g, o = jnp.split(gates, GATES, axis=-1)
-    return jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
+    i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
+    cell = f * cell + i * g
+    return o * jnp.tanh(cell), cell, (i, f, g, o)
 
 
 @jax.custom_vjp
@@ -57,62 +65,52 @@ def _recurrence(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The sequential part: projected [T, B, 4H] to (h [T, B, H], last h [B, H], last c [B, H])."""
 
-    def step(carry, inputs):
-        h, c = carry
-        x, k = inputs
-        i, f, g, o = _activate(x + (h * k) @ recurrent_kernel)
-        c = f * (c * k) + i * g
-        h = o * jnp.tanh(c)
+    def step(carry: Pair, inputs: Pair) -> tuple[Pair, jax.Array]:
+        (h, c), (x, k) = carry, inputs
+        h, c, _ = _cell(x + (h * k) @ recurrent_kernel, c * k)
         return (h, c), h
 
-    unroll = min(SCAN_UNROLL, projected.shape[0])
-    (last_h, last_c), outputs = jax.lax.scan(step, (hidden, cell), (projected, keep), unroll=unroll)
+    (last_h, last_c), outputs = jax.lax.scan(step, (hidden, cell), (projected, keep))
     return outputs, last_h, last_c
 
 
-def _recurrence_forward(projected, recurrent_kernel, hidden, cell, keep):
-    """As `_recurrence`, keeping the gates before their activation and the cells for the gradient."""
+def _recurrence_forward(
+    projected: jax.Array, recurrent_kernel: jax.Array, hidden: jax.Array, cell: jax.Array, keep: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array, jax.Array], tuple[Any, ...]]:
+    """As `_recurrence`, and keeps for the gradient the state before each step and the activated gates."""
 
-    def step(carry, inputs):
-        h, c = carry
-        x, k = inputs
-        gates = x + (h * k) @ recurrent_kernel
-        i, f, g, o = _activate(gates)
-        c = f * (c * k) + i * g
-        h = o * jnp.tanh(c)
-        return (h, c), (h, c, gates)
+    def step(carry: Pair, inputs: Pair) -> tuple[Pair, tuple[Any, ...]]:
+        (h, c), (x, k) = carry, inputs
+        h_before, c_before = h * k, c * k
+        h, c, activated = _cell(x + h_before @ recurrent_kernel, c_before)
+        return (h, c), (h, h_before, c_before, activated)
 
-    unroll = min(SCAN_UNROLL, projected.shape[0])
-    (last_h, last_c), (outputs, cells, gates) = jax.lax.scan(step, (hidden, cell), (projected, keep), unroll=unroll)
-    return (outputs, last_h, last_c), (recurrent_kernel, hidden, cell, keep, outputs, cells, gates)
+    (last_h, last_c), (outputs, *saved) = jax.lax.scan(step, (hidden, cell), (projected, keep))
+    return (outputs, last_h, last_c), (recurrent_kernel, keep, *saved)
 
 
-def _recurrence_backward(residuals, cotangents):
-    """Back-propagation through time; yields the gradient of every gate, then one product for the matrix."""
-    recurrent_kernel, hidden, cell, keep, outputs, cells, gates = residuals
+def _recurrence_backward(residuals: tuple[Any, ...], cotangents: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+    """Back-propagation through time: the gradient of every gate, then one product for the recurrent matrix."""
+    recurrent_kernel, keep, h_before, c_before, activated = residuals
     d_outputs, d_last_h, d_last_c = cotangents
-    h_before = jnp.concatenate([hidden[None], outputs[:-1]]) * keep
-    c_before = jnp.concatenate([cell[None], cells[:-1]]) * keep
     transposed_kernel = recurrent_kernel.T
 
-    def step(carry, inputs):
+    def step(carry: Pair, inputs: tuple[Any, ...]) -> tuple[Pair, jax.Array]:
         d_h, d_c = carry
-        d_output, k, c, c_prev, gate = inputs
-        i, f, g, o = _activate(gate)
-        tanh_c = jnp.tanh(c)
+        d_output, k, c_prev, (i, f, g, o) = inputs
+        tanh_c = jnp.tanh(f * c_prev + i * g)
         d_h = d_h + d_output
         d_c = d_c + d_h * o * (1 - tanh_c * tanh_c)
-        d_gate = jnp.concatenate(
+        d_gates = jnp.concatenate(
             [d_c * g * i * (1 - i), d_c * c_prev * f * (1 - f), d_c * i * (1 - g * g), d_h * tanh_c * o * (1 - o)], -1
         )
-        return ((d_gate @ transposed_kernel) * k, d_c * f * k), d_gate
+        return ((d_gates @ transposed_kernel) * k, d_c * f * k), d_gates
 
-    unroll = min(SCAN_UNROLL, keep.shape[0])
     (d_hidden, d_cell), d_gates = jax.lax.scan(
-        step, (d_last_h, d_last_c), (d_outputs, keep, cells, c_before, gates), reverse=True, unroll=unroll
+        step, (d_last_h, d_last_c), (d_outputs, keep, c_before, activated), reverse=True
     )
     d_recurrent = jnp.einsum("tbh,tbg->hg", h_before, d_gates)
-    return d_gates, d_recurrent, d_hidden, d_cell, jnp.zeros_like(keep)  # keep is data: nobody asks for its gradient
+    return d_gates, d_recurrent, d_hidden, d_cell, jnp.zeros_like(keep)  # keep is data: no gradient
 
 
 _recurrence.defvjp(_recurrence_forward, _recurrence_backward)

@@ -154,14 +154,13 @@ class Policy(nn.Module):
             observation = observation[:, None]
             is_first = None if is_first is None else is_first[:, None]
         batch, steps = observation.shape[:2]
-        if carry is None:
-            carry = jnp.asarray(zero_carry(batch, self.hidden_size, self.mirror is not None))
+        initial = zero_carry(batch, self.hidden_size, self.mirror is not None) if carry is None else carry
         streams = [observation] if self.mirror is None else [observation, self.mirror.observation(observation)]
         count = len(streams)
         # Streams become neighbours on the batch axis, so a batch split over devices stays where it is.
         inputs = normalize_observation(jnp.stack(streams, axis=1), observation_mean, observation_std)
         inputs = jnp.swapaxes(inputs.reshape(batch * count, steps, -1), 0, 1)  # time-major for the scan
-        state = jnp.moveaxis(carry.reshape(batch, LSTM_LAYERS, 2, count, -1), 3, 1)
+        state = jnp.moveaxis(jnp.reshape(initial, (batch, LSTM_LAYERS, 2, count, -1)), 3, 1)
         state = state.reshape(batch * count, LSTM_LAYERS, 2, -1)
         keep = jnp.ones((batch, steps)) if is_first is None else 1.0 - is_first.astype(jnp.float32)
         keep = jnp.repeat(keep, count, axis=0).T[..., None]
@@ -171,15 +170,16 @@ class Policy(nn.Module):
             new_state.append(jnp.stack([hidden, cell], axis=1))
             inputs = jnp.tanh(outputs)
         new_carry = jnp.stack(new_state, axis=1).reshape(batch, count, LSTM_LAYERS, 2, -1)
-        new_carry = jnp.moveaxis(new_carry, 1, 3).reshape(carry.shape)
-        mean = self._mean(jnp.swapaxes(inputs, 0, 1).reshape(batch, count, steps, -1))
+        new_carry = jnp.moveaxis(new_carry, 1, 3).reshape(initial.shape)
+        mean = jnp.swapaxes(self._mean(inputs.reshape(steps, batch, count, -1)), 0, 1)
         return (mean[:, 0] if single else mean), new_carry
 
     def _mean(self, features: jax.Array) -> jax.Array:
-        """Features [B, streams, T, H] to the mean action [B, T, A]."""
+        """Features [T, B, streams, H] to the mean action [T, B, A]."""
         kernel, bias = self.head
         head = features @ kernel + bias
-        logits = head[:, 0] if self.mirror is None else 0.5 * (head[:, 0] + self.mirror.action(head[:, 1]))
+        own = head[..., 0, :]
+        logits = own if self.mirror is None else 0.5 * (own + self.mirror.action(head[..., 1, :]))
         return jnp.tanh(logits)
 
 
@@ -199,7 +199,9 @@ class Value(nn.Module):
         sizes = (self.observation_size, self.hidden_size, self.hidden_size, 1)
         self.layers = [
             (
-                self.param(f"dense_{layer}_kernel", nn.initializers.orthogonal(scale), (sizes[layer], sizes[layer + 1])),
+                self.param(
+                    f"dense_{layer}_kernel", nn.initializers.orthogonal(scale), (sizes[layer], sizes[layer + 1])
+                ),
                 self.param(f"dense_{layer}_bias", nn.initializers.zeros, (sizes[layer + 1],)),
             )
             for layer, scale in enumerate((2.0**0.5, 2.0**0.5, 1.0))
@@ -236,7 +238,5 @@ def make_networks(
         check_mirror(mirror, observation_size, action_size)
     else:
         mirror = None
-    policy = Policy(
-        observation_size, action_size, config.hidden_size, config.initial_log_std, config.learn_std, mirror
-    )
+    policy = Policy(observation_size, action_size, config.hidden_size, config.initial_log_std, config.learn_std, mirror)
     return policy, Value(observation_size, config.hidden_size, mirror)

@@ -1,7 +1,7 @@
 """The learner: one PPO iteration as one jitted program over a mesh of devices.
 
 Separate losses, optimisers and gradient clips for policy and value (paper II.E); epochs and minibatches run inside
-one scan. Parameters are replicated, trajectories are split over the mesh axis `data`. On one CPU it is the same program.
+one scan. Parameters are replicated and trajectories split over the mesh axis `data`; one CPU runs the same program.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hasrl_jax.config import Config, PPOConfig
-from hasrl_jax.learn import distributions, normalize, returns
+from hasrl_jax.learn import normalize, returns
 from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS, minibatch_indices
 from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, value_loss
 from hasrl_jax.learn.networks import Mirror, Policy, Value, make_networks
@@ -74,21 +74,25 @@ def init_learner(
     if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.key_data(key)
     policy, value = make_networks(config.network, observation_size, action_size, mirror)
-    policy_key, value_key, key = jax.random.split(key, 3)
-    observation = jnp.zeros((1, observation_size))
-    policy_params = dict(policy.init(policy_key, observation)["params"])
-    value_params = dict(value.init(value_key, observation)["params"])
     optimizer = make_optimizer(config.ppo)
-    return LearnerState(
-        policy_params=policy_params,
-        value_params=value_params,
-        policy_opt_state=optimizer.init(policy_params),
-        value_opt_state=optimizer.init(value_params),
-        normalizer=normalize.initial_normalizer(observation_size),
-        key=key,
-        update_count=jnp.zeros((), jnp.int32),
-        env_steps=jnp.zeros((), jnp.int32),
-    )
+
+    def create(key: jax.Array) -> LearnerState:
+        policy_key, value_key, key = jax.random.split(key, 3)
+        observation = jnp.zeros((1, observation_size))
+        policy_params = dict(policy.init(policy_key, observation)["params"])
+        value_params = dict(value.init(value_key, observation)["params"])
+        return LearnerState(
+            policy_params=policy_params,
+            value_params=value_params,
+            policy_opt_state=optimizer.init(policy_params),
+            value_opt_state=optimizer.init(value_params),
+            normalizer=normalize.initial_normalizer(observation_size),
+            key=key,
+            update_count=jnp.zeros((), jnp.int32),
+            env_steps=jnp.zeros((), jnp.int32),
+        )
+
+    return jax.jit(create)(key)  # one program starts sooner than its operations one by one
 
 
 def export_parameters(state: LearnerState) -> dict[str, np.ndarray]:
@@ -205,7 +209,7 @@ class Update:
         # Written so that a KL that is not a number stops the policy too.
         active = metrics["approx_kl"] <= ppo.max_kl if ppo.max_kl > 0 else jnp.asarray(True)
         policy = jax.tree.map(lambda new, old: jnp.where(active, new, old), updated, policy)
-        metrics |= {"policy_updates": active.astype(jnp.float32), "policy_gradient_norm": optax.global_norm(gradient)}
+        metrics |= {"policy_updates": active.astype(jnp.float32), "policy_gradient_norm": optax.tree.norm(gradient)}
         return policy, active, metrics
 
     def _update_value(
@@ -214,7 +218,7 @@ class Update:
         ppo = self.config.ppo
         loss, gradient = jax.value_and_grad(value_loss)(value[0], self.value, batch, *statistics, ppo)
         updated = self._step(value, gradient, scale * ppo.value_learning_rate)
-        return updated, {"critic_loss": loss, "value_gradient_norm": optax.global_norm(gradient)}
+        return updated, {"critic_loss": loss, "value_gradient_norm": optax.tree.norm(gradient)}
 
     def _step(self, trained: Trained, gradient: Parameters, learning_rate: jax.Array) -> Trained:
         params, opt_state = trained
@@ -222,9 +226,7 @@ class Update:
         return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), opt_state
 
 
-def make_update(
-    config: Config, observation_size: int, action_size: int, mirror: Mirror | None, mesh: Mesh
-) -> Update:
+def make_update(config: Config, observation_size: int, action_size: int, mirror: Mirror | None, mesh: Mesh) -> Update:
     """The update of a configuration; arguments as in `init_learner`, `mesh` from `make_mesh`.
 
     Raises:

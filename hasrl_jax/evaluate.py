@@ -1,0 +1,184 @@
+"""Runs a policy for whole episodes and reports what it can do: `python -m hasrl_jax.evaluate`."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hasrl_jax import cli
+from hasrl_jax.collect import numpy_policy
+from hasrl_jax.config import Config, ConfigError, from_dict
+from hasrl_jax.envs.cpu_env import CpuEnvs
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import Task
+
+SETTLE_S = 3.0  # the speed error counts from this long after an episode's start or a new command
+PAPER_RATE = {"timestep_s": 0.0005, "steps_per_env_step": 50, "integrator": "Euler", "solver_iterations": 50}
+
+
+class Episodes(NamedTuple):
+    """One entry per episode, and one row per environment step while any of them lasted."""
+
+    episode_return: np.ndarray  # [N] undiscounted
+    episode_length: np.ndarray  # [N] environment steps
+    reached_cap: np.ndarray  # [N] bool: ended by the time limit, not by a fall
+    seconds: np.ndarray  # [N] simulated time upright
+    measures: np.ndarray  # [T, N, M] the task's measures; NaN after an episode's end
+
+
+def run_episodes(
+    config: Config, task: Task, parameters: numpy_policy.Parameters, episodes: int, seed: int, mean_action: bool = True
+) -> Episodes:
+    """Plays `episodes` episodes side by side in C MuJoCo, with the LSTM state carried through each.
+
+    Args:
+      config: reads the network, and `collect.max_episode_steps` as the cap.
+      task: the task to play.
+      parameters: as `learn.ppo.export_parameters` returns them.
+      episodes: N.
+      seed: the same seed gives the same episodes.
+      mean_action: act without exploration noise.
+    """
+    mirror = task.mirror if config.network.symmetric else None
+    cap = config.collect.max_episode_steps
+    envs = CpuEnvs(task, episodes, cap)
+    rng = np.random.Generator(np.random.Philox(seed))
+    state = envs.reset(rng)
+    width = config.network.hidden_size * (1 if mirror is None else 2)
+    carry = np.zeros((episodes, numpy_policy.LAYERS, 2, width), np.float32)
+    std = np.exp(numpy_policy.log_std(parameters, mirror))
+    env_step_s = state.model_fields.get("timestep", task.model.opt.timestep) * task.steps_per_env_step
+    total, length = np.zeros(episodes), np.zeros(episodes, np.int64)
+    reached_cap, running = np.zeros(episodes, bool), np.ones(episodes, bool)
+    measures = np.full((cap, episodes, len(task.measures)), np.nan)
+    for t in range(cap):
+        inputs = numpy_policy.streams(state.observation, parameters, mirror)
+        action, carry = numpy_policy.policy_step(parameters, inputs, carry, state.is_first, mirror)
+        if not mean_action:
+            action = action + std * rng.standard_normal(action.shape, np.float32)
+        state, result = envs.step(state, action, rng)
+        measures[t, running] = result.measures[running]
+        total += np.where(running, result.reward, 0.0)
+        length += running
+        reached_cap |= running & result.truncated
+        running &= ~(result.terminated | result.truncated | result.diverged)
+        if not running.any():
+            break
+    return Episodes(total, length, reached_cap, length * env_step_s, measures[: t + 1])
+
+
+def summarize(episodes: Episodes, task: Task) -> dict[str, Any]:
+    """Means with 95 % confidence intervals, ready for JSON."""
+    summary: dict[str, Any] = {
+        "episodes": len(episodes.episode_return),
+        "episode_return": mean_interval(episodes.episode_return),
+        "episode_length": mean_interval(episodes.episode_length),
+        "seconds_upright": mean_interval(episodes.seconds),
+        "share_reaching_cap": share_interval(episodes.reached_cap),
+    }
+    if "forward_speed" in task.measures:
+        summary |= _speeds(episodes, task)
+    return summary
+
+
+def _speeds(episodes: Episodes, task: Task) -> dict[str, Any]:
+    """Speed, command and their difference after settling, averaged per episode first."""
+    column = {name: episodes.measures[..., index] for index, name in enumerate(task.measures)}
+    settled = settled_steps(column["forward_command"], round(SETTLE_S / task.env_step_s))
+    has_any = settled.any(axis=0)
+
+    def settled_mean(values: np.ndarray) -> np.ndarray:
+        return np.where(settled, values, 0.0).sum(axis=0)[has_any] / settled.sum(axis=0)[has_any]
+
+    forward, lateral = column["forward_speed"], column["lateral_speed"]
+    error, lateral_error = forward - column["forward_command"], lateral - column["lateral_command"]
+    return {
+        "settled_episodes": int(has_any.sum()),
+        "forward_speed": mean_interval(settled_mean(forward)),
+        "forward_command": mean_interval(settled_mean(column["forward_command"])),
+        "forward_speed_error": mean_interval(np.abs(settled_mean(error))),
+        "lateral_speed_error": mean_interval(np.abs(settled_mean(lateral_error))),
+        "forward_speed_error_instantaneous": mean_interval(settled_mean(np.abs(error))),
+    }
+
+
+def settled_steps(command: np.ndarray, settle_steps: int) -> np.ndarray:
+    """Where a command [T, N] (NaN after the end) has held for more than `settle_steps`: [T, N] bool."""
+    changed = np.ones(command.shape, bool)
+    changed[1:] = command[1:] != command[:-1]
+    steps = np.arange(len(command))[:, None]
+    since = steps - np.maximum.accumulate(np.where(changed, steps, 0), axis=0)
+    return (since >= settle_steps) & np.isfinite(command)
+
+
+def mean_interval(values: np.ndarray) -> dict[str, float | None]:
+    """Mean and the 95 % normal confidence interval of the mean; None without values."""
+    if len(values) == 0:
+        return {"mean": None, "low": None, "high": None}
+    half = 1.96 * np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    mean = float(np.mean(values))
+    return {"mean": mean, "low": mean - float(half), "high": mean + float(half)}
+
+
+def share_interval(hits: np.ndarray) -> dict[str, float]:
+    """Share of true values and its 95 % Wilson interval."""
+    n, share, z = len(hits), float(np.mean(hits)), 1.96
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return {"mean": share, "low": float(centre - half), "high": float(centre + half)}
+
+
+def evaluate(arguments: list[str]) -> None:
+    """The command: loads a policy, plays, prints and writes the summary."""
+    from hasrl_jax.policies import load_policy_parameters
+
+    parser = argparse.ArgumentParser(
+        prog="python -m hasrl_jax.evaluate",
+        description="Play fixed-seed episodes. Any config field can be overridden: --cassie.randomize.enabled False",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
+    parser.add_argument("--policy", help="a policy file")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=20.0, help="time limit of an episode")
+    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mean")
+    parser.add_argument("--json", type=Path, help="write the statistics here")
+    known, rest = parser.parse_known_args(arguments)
+    if known.episodes < 1:
+        raise ConfigError(f"--episodes: got {known.episodes}; expected at least 1")
+    if known.seed < 0:
+        raise ConfigError(f"--seed: got {known.seed}; expected 0 or more")
+    config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    if known.physics == "paper" and config.task == "cassie":
+        config = from_dict({"physics": PAPER_RATE}, config)
+    config = cli.override(config, rest, "evaluate")
+    env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
+    config = from_dict({"collect": {"max_episode_steps": max(1, round(known.seconds / env_step_s))}}, config)
+    task = make_task(config)
+    episodes = run_episodes(config, task, parameters, known.episodes, known.seed, not known.stochastic)
+    summary = {"physics_hz": 1 / config.physics.timestep_s, "cap_seconds": known.seconds, "seed": known.seed}
+    summary |= summarize(episodes, task)
+    for name, value in summary.items():
+        print(f"{name:36s} {_readable(value)}")
+    if known.json:
+        known.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, dict):
+        return "none" if value["mean"] is None else f"{value['mean']:.3f}  (95 % {value['low']:.3f} to {value['high']:.3f})"
+    return f"{value:g}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    cli.log_to_terminal()
+    return cli.run(lambda: evaluate(sys.argv[1:] if argv is None else argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

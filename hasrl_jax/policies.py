@@ -1,0 +1,65 @@
+"""Loads the parameters that a policy acts with, from a run directory or from a released policy file."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from hasrl_jax import checkpoint
+from hasrl_jax import config as config_module
+from hasrl_jax.checkpoint import CheckpointError
+from hasrl_jax.collect.numpy_policy import parameter_shapes
+from hasrl_jax.config import Config, ConfigError
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.learn import ppo
+from hasrl_jax.run_directory import CHECKPOINTS_DIRECTORY, load_run_config
+
+
+def load_policy_parameters(
+    run_dir: str | Path | None, policy: str | Path | None
+) -> tuple[Config, dict[str, np.ndarray]]:
+    """The configuration a policy was trained with, and its parameters as `ppo.export_parameters` names them.
+
+    Args:
+      run_dir: a run directory, whose newest whole checkpoint is taken; or None.
+      policy: a file of `checkpoint.save_policy` with its configuration under `config`; or None.
+
+    Raises:
+      ConfigError: not exactly one of the two is given.
+      RunError, CheckpointError: what is named is missing, damaged or of another network.
+    """
+    if (run_dir is None) == (policy is None):
+        raise ConfigError("--run-dir and --policy: give exactly one of them")
+    if run_dir is not None:
+        return _from_run(Path(run_dir))
+    assert policy is not None
+    return _from_file(Path(policy))
+
+
+def policy_metadata(config: Config) -> dict[str, object]:
+    """What a released policy file must carry besides its parameters."""
+    return {"config": config_module.to_dict(config)}
+
+
+def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
+    config = load_run_config(run_dir)
+    task = make_task(config)
+    template = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    loaded = checkpoint.load(run_dir / CHECKPOINTS_DIRECTORY, template)
+    return config, ppo.export_parameters(loaded.learner)
+
+
+def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
+    parameters, metadata = checkpoint.load_policy(path)
+    try:
+        config = config_module.from_dict(metadata["config"])
+        config_module.check(config)
+    except (KeyError, TypeError, ConfigError) as error:
+        raise CheckpointError(f"{path}: its configuration cannot be read: {error}") from None
+    task = make_task(config)
+    wanted = parameter_shapes(task.observation_size, task.action_size, config.network.hidden_size)
+    for name, shape in wanted.items():
+        found = parameters[name].shape if name in parameters else "missing"
+        if found != shape:
+            raise CheckpointError(f"{path}: parameter {name} is {found}; its configuration asks for {shape}")
+    return config, {name: parameters[name] for name in wanted}

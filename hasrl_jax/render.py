@@ -1,0 +1,245 @@
+"""Films a policy without a display: `python -m hasrl_jax.render --run-dir DIR --out FILE.mp4`.
+
+Nothing here imports MuJoCo before the OpenGL library is chosen, because MuJoCo fixes it when it is imported.
+"""
+
+import argparse
+import logging
+import os
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hasrl_jax import opengl
+
+if TYPE_CHECKING:
+    from hasrl_jax.config import Config
+    from hasrl_jax.envs.gymnasium_env import TaskEnv
+
+STRIP_FRAMES = 8
+STRIP_HEIGHT_PX = 270
+PUSH_S = 0.2  # how long --push acts
+SPEED_AVERAGE_S = 0.5  # the shown measures are means over this long: a gait sways
+SHADOW_PX = 2048  # shadow map; software rendering takes twice as long with the model's own size
+
+
+class Moment(NamedTuple):
+    """One frame of the film, taken before the environment step that it precedes."""
+
+    image: np.ndarray  # [height, width, 3] uint8
+    time_s: float  # since the start of the film
+    measures: dict[str, float]  # means of the task's measures over the last SPEED_AVERAGE_S
+    falls: int  # episodes that have ended so far
+    pushed: bool
+
+
+class Push(NamedTuple):
+    """A sideways force on the whole robot."""
+
+    force_n: float  # to the left is positive
+    at_s: float  # when it starts, since the start of the film
+
+
+def play(env: "TaskEnv", parameters: dict[str, np.ndarray], frames: int, seed: int, push: Push) -> Iterator[Moment]:
+    """Acts with the policy's mean action, one moment per environment step; an episode that ends is followed by another.
+
+    Args:
+      env: built with `render_mode="rgb_array"`.
+      parameters: as `ppo.export_parameters` returns them.
+      frames: environment steps to film.
+      seed: of the environment.
+      push: a force of 0 does nothing.
+    """
+    from hasrl_jax.collect import numpy_policy
+
+    mirror = env.task.mirror if env.config.network.symmetric else None
+    width = env.config.network.hidden_size * (1 if mirror is None else 2)
+    carry = np.zeros((1, numpy_policy.LAYERS, 2, width), np.float32)
+    env_step_s = env.task.env_step_s
+    recent: deque[list[float]] = deque(maxlen=max(1, round(SPEED_AVERAGE_S / env_step_s)))
+    observation, _ = env.reset(seed=seed)
+    is_first, falls = True, 0
+    for frame in range(frames):
+        time_s = frame * env_step_s
+        pushed = push.force_n != 0 and push.at_s <= time_s < push.at_s + PUSH_S
+        if pushed:
+            env.push(0.0, push.force_n * env_step_s)
+        means = np.mean(recent, axis=0).tolist() if recent else []
+        image = env.render()
+        assert image is not None
+        yield Moment(image, time_s, dict(zip(env.task.measures, means, strict=False)), falls, pushed)
+
+        inputs = numpy_policy.streams(observation[None], parameters, mirror)
+        action, carry = numpy_policy.policy_step(parameters, inputs, carry, np.array([is_first]), mirror)
+        observation, _, terminated, truncated, info = env.step(action[0])
+        recent.append([info[name] for name in env.task.measures])
+        is_first = terminated or truncated
+        if is_first:
+            observation, _ = env.reset()
+            recent.clear()
+            falls += 1
+
+
+def caption(moment: Moment) -> str:
+    """The text drawn on a frame: time, measured and commanded speed; other tasks show their measures."""
+    parts, shown = [f"{moment.time_s:5.2f} s"], moment.measures
+    if "forward_command" in shown:
+        parts.append(f"forward {shown['forward_speed']:+.2f} m/s, commanded {shown['forward_command']:+.2f}")
+        parts.append(f"left {shown['lateral_speed']:+.2f} m/s, commanded {shown['lateral_command']:+.2f}")
+    else:
+        parts += [f"{name.replace('_', ' ')} {value:+.2f}" for name, value in shown.items()]
+    if moment.falls:
+        parts.append(f"falls {moment.falls}")
+    return "    ".join(parts) + ("    PUSH" if moment.pushed else "")
+
+
+def draw_text(image: np.ndarray, text: str) -> np.ndarray:
+    """A copy of `image` with `text` in its upper left corner, sized to fit."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    margin = 8
+    for size in range(max(10, image.shape[0] // 24), 7, -1):
+        font = ImageFont.load_default(size)
+        if draw.textlength(text, font=font) <= image.shape[1] - 2 * margin:
+            break
+    draw.text((margin, margin), text, fill="white", font=font, stroke_width=2, stroke_fill="black")
+    return np.asarray(picture)
+
+
+def film(env: "TaskEnv", moments: Iterator[Moment], frames: int, out: Path, strip: Path) -> int:
+    """Writes the video in real time and the strip of evenly spaced frames; returns the falls seen."""
+    import imageio_ffmpeg
+    import mediapy
+
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    chosen = set(np.linspace(0, frames - 1, min(STRIP_FRAMES, frames)).round().astype(int).tolist())
+    stills, falls = [], 0
+    with mediapy.VideoWriter(str(out), env.frame_size, fps=1 / env.task.env_step_s, crf=20) as writer:
+        for index, moment in enumerate(moments):
+            writer.add_image(draw_text(moment.image, caption(moment)))
+            falls = moment.falls
+            if index in chosen:
+                stills.append(_still(moment))
+    mediapy.write_image(str(strip), np.concatenate(stills, axis=1))
+    return falls
+
+
+def _still(moment: Moment) -> np.ndarray:
+    """The middle of a frame as a square of STRIP_HEIGHT_PX with its time."""
+    from PIL import Image
+
+    height, width = moment.image.shape[:2]
+    side = min(height, width)
+    left, top = (width - side) // 2, (height - side) // 2
+    square = Image.fromarray(moment.image[top : top + side, left : left + side])
+    return draw_text(np.asarray(square.resize((STRIP_HEIGHT_PX, STRIP_HEIGHT_PX))), f"{moment.time_s:.2f} s")
+
+
+def render(known: argparse.Namespace, rest: list[str]) -> None:
+    """The command: loads a policy, films it, writes both files.
+
+    Raises:
+      ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
+    """
+    from hasrl_jax import cli
+    from hasrl_jax.envs import gymnasium_env
+    from hasrl_jax.policies import load_policy_parameters
+
+    _check(known)
+    config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    config = _config_to_film(config, known)
+    config = cli.override(config, rest, "render")
+    strip = known.strip or known.out.with_suffix(".png")
+    for path in (known.out, strip):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab"):  # fails now, and not after minutes of rendering
+            pass
+    env = gymnasium_env.TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX)
+    try:
+        frames = max(1, round(known.seconds / env.task.env_step_s))
+        push = Push(known.push, known.push_at)
+        falls = film(env, play(env, parameters, frames, known.seed, push), frames, known.out, strip)
+    finally:
+        env.close()
+    print(f"{known.out} and {strip}: {frames} frames, {known.seconds:g} s, {falls} falls")
+
+
+def _config_to_film(config: "Config", known: argparse.Namespace) -> "Config":
+    """The nominal robot, so that the film runs in real time, the commands asked for, and no time limit."""
+    from hasrl_jax.config import from_dict
+    from hasrl_jax.envs.gymnasium_env import fixed_command
+
+    env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
+    changes = {"cassie": {"randomize": {"enabled": False}}}
+    changes["collect"] = {"max_episode_steps": max(1, round(known.seconds / env_step_s)) + 1}
+    return fixed_command(from_dict(changes, config), known.forward, known.lateral)
+
+
+def _check(known: argparse.Namespace) -> None:
+    from hasrl_jax.config import ConfigError
+
+    for name in ("width", "height"):
+        value = getattr(known, name)
+        if not 64 <= value <= 4096 or value % 2:
+            raise ConfigError(f"--{name}: got {value}; expected an even number from 64 to 4096")
+    for name in ("forward", "lateral", "push", "push_at"):
+        value = getattr(known, name)
+        if value is not None and not np.isfinite(value):
+            raise ConfigError(f"--{name.replace('_', '-')}: got {value}; expected a finite number")
+    if not 0 < known.seconds <= 3600:
+        raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most 3600")
+    if known.seed < 0:
+        raise ConfigError(f"--seed: got {known.seed}; expected 0 or more")
+    if known.out.suffix.lower() != ".mp4":
+        raise ConfigError(f"--out: got {known.out}; expected a name that ends in .mp4")
+
+
+def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    parser = argparse.ArgumentParser(
+        prog="python -m hasrl_jax.render",
+        description="Film a policy. Any config field can be overridden: --cassie.randomize.enabled True",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is filmed")
+    parser.add_argument("--policy", type=Path, help="a policy file (.npz)")
+    parser.add_argument("--out", type=Path, default=Path("policy.mp4"), help="the video")
+    parser.add_argument("--strip", type=Path, help="a row of frames as one PNG; default: beside the video")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--forward", type=float, help="commanded forward speed, m/s")
+    parser.add_argument("--lateral", type=float, help="commanded speed to the left, m/s")
+    parser.add_argument("--push", type=float, default=0.0, help=f"force to the left for {PUSH_S} s, N")
+    parser.add_argument("--push-at", type=float, default=3.0, help="when the push starts, s")
+    parser.add_argument("--width", type=int, default=640, help="pixels")
+    parser.add_argument("--height", type=int, default=480, help="pixels")
+    parser.add_argument("--camera", default="track", help="a camera of the model (Cassie: track, side, front)")
+    return parser.parse_known_args(arguments)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    arguments = sys.argv[1:] if argv is None else argv
+    known, rest = _parse(arguments)
+    backend = opengl.choose()
+    if backend is None:
+        print(f"error: {opengl.MISSING}", file=sys.stderr)
+        return 1
+    if "mujoco" in sys.modules and os.environ.get("MUJOCO_GL") != backend:  # too late to choose in this process
+        command = [sys.executable, "-m", "hasrl_jax.render", *arguments]
+        return subprocess.run(command, env=os.environ | {"MUJOCO_GL": backend}).returncode
+    os.environ["MUJOCO_GL"] = backend
+    from hasrl_jax import cli
+
+    return cli.run(lambda: render(known, rest))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

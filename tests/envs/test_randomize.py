@@ -1,0 +1,86 @@
+"""Dynamics randomisation: what changes, by how much, and from which draws."""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from hasrl_jax.config import PhysicsConfig, RandomizeConfig
+from hasrl_jax.envs import randomize
+from hasrl_jax.envs.model import load_model
+
+CONFIG = RandomizeConfig()
+MODEL = load_model("cassie.xml", PhysicsConfig())
+NOMINAL = randomize.nominal(MODEL)
+N = 400
+
+
+@pytest.fixture(scope="module")
+def uniforms() -> np.ndarray:
+    return np.random.default_rng(0).random((N, randomize.num_uniforms(NOMINAL)))
+
+
+@pytest.fixture(scope="module")
+def fields(uniforms: np.ndarray) -> dict[str, np.ndarray]:
+    return randomize.model_fields(uniforms, NOMINAL, CONFIG, np)
+
+
+def _fills(values: np.ndarray, bounds: tuple[float, float]) -> bool:
+    """All values within the bounds, and the bounds nearly reached."""
+    low, high = bounds
+    reach = 0.05 * (high - low)
+    return bool(values.min() >= low and values.max() < high and values.min() < low + reach and values.max() > high - reach)
+
+
+def test_ranges(fields: dict[str, np.ndarray]) -> None:
+    mass_scale = fields["body_mass"][:, 1:] / NOMINAL.body_mass[1:]
+    assert all(_fills(mass_scale[:, body], CONFIG.mass_scale) for body in range(MODEL.nbody - 1))
+    assert _fills(fields["geom_friction"][..., 0], CONFIG.sliding_friction)
+    assert _fills(fields["geom_friction"][..., 1], CONFIG.torsional_friction)
+    assert _fills(fields["geom_friction"][..., 2], CONFIG.rolling_friction)
+    assert _fills(fields["timestep"] / MODEL.opt.timestep, CONFIG.physics_rate_scale)
+    assert (fields["geom_friction"] == fields["geom_friction"][:, :1]).all()  # one draw for all geoms
+
+
+def test_only_the_named_joints_change_their_damping(fields: dict[str, np.ndarray]) -> None:
+    draws = set()
+    for joint in range(MODEL.njnt):
+        name = MODEL.joint(joint).name
+        side, _, kind = name.partition("-")
+        start = MODEL.jnt_dofadr[joint]
+        count = 3 if MODEL.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else 1
+        damping = fields["dof_damping"][:, start : start + count]
+        nominal = NOMINAL.dof_damping[start : start + count]
+        if side in ("left", "right") and kind in randomize.DAMPED_JOINTS:
+            scale = damping / nominal
+            assert _fills(scale[:, 0], CONFIG.damping_scale), name
+            np.testing.assert_allclose(scale, scale[:, :1].repeat(count, 1), err_msg=name)  # one draw per joint
+            draws.add(tuple(scale[:3, 0]))
+        else:
+            assert (damping == nominal).all(), name
+    assert len(draws) == 2 * len(randomize.DAMPED_JOINTS)  # every joint has a draw of its own
+
+
+def test_inertia_and_subtree_follow_the_mass(fields: dict[str, np.ndarray]) -> None:
+    scale = fields["body_mass"][:, 1:] / NOMINAL.body_mass[1:]
+    np.testing.assert_allclose(fields["body_inertia"][:, 1:], NOMINAL.body_inertia[1:] * scale[..., None])
+    np.testing.assert_allclose(fields["body_subtreemass"][:, 0], fields["body_mass"].sum(axis=1))
+    data = mujoco.MjData(MODEL)
+    for row in range(3):  # MuJoCo's own sum
+        model = load_model("cassie.xml", PhysicsConfig())
+        model.body_mass[:] = fields["body_mass"][row]
+        mujoco.mj_setConst(model, data)
+        np.testing.assert_allclose(fields["body_subtreemass"][row], model.body_subtreemass)
+
+
+def test_same_uniforms_same_fields(uniforms: np.ndarray, fields: dict[str, np.ndarray]) -> None:
+    again = randomize.model_fields(uniforms[7:8], NOMINAL, CONFIG, np)
+    jax_fields = randomize.model_fields(jnp.asarray(uniforms[7:8]), NOMINAL, CONFIG, jnp)
+    assert set(again) == set(fields) == set(jax_fields)
+    for name, values in again.items():
+        np.testing.assert_array_equal(values[0], fields[name][7], err_msg=name)
+        np.testing.assert_allclose(values, jax_fields[name], rtol=1e-5, err_msg=name)
+
+
+def test_off_switch(uniforms: np.ndarray) -> None:
+    assert randomize.model_fields(uniforms, NOMINAL, RandomizeConfig(enabled=False), np) == {}

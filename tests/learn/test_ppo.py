@@ -1,0 +1,246 @@
+"""The update as a whole. The batches are small so that the file runs in seconds."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hasrl_jax.config import Config, NetworkConfig, PPOConfig
+from hasrl_jax.learn import distributions, losses, normalize, ppo
+from hasrl_jax.learn.networks import make_networks, zero_carry
+from hasrl_jax.types import Trajectory
+
+OBSERVATION, ACTION, H, B, T = 5, 2, 8, 16, 6
+NETWORK = NetworkConfig(hidden_size=H)
+PPO = PPOConfig(epochs=2, minibatch_trajectories=8, entropy_coefficient=0.01)
+
+
+def _config(network: dict[str, Any] | None = None, **changes: Any) -> Config:
+    return Config(network=dataclasses.replace(NETWORK, **(network or {})), ppo=dataclasses.replace(PPO, **changes))
+
+
+@functools.cache
+def _compiled(config: Config, devices: int) -> tuple[ppo.LearnerState, ppo.Update]:
+    """One program per configuration for the whole file: compiling is what takes the time here."""
+    mesh = ppo.make_mesh(jax.devices()[:devices])
+    state = ppo.init_learner(config, OBSERVATION, ACTION, None, jax.random.PRNGKey(0))
+    return jax.device_get(state), ppo.make_update(config, OBSERVATION, ACTION, None, mesh)
+
+
+def _learner(config: Config, devices: int = 1) -> tuple[ppo.LearnerState, ppo.Update]:
+    state, update = _compiled(config, devices)
+    return jax.tree.map(jnp.array, state), update  # a copy, since an update donates its state
+
+
+@functools.cache
+def _networks(config: NetworkConfig) -> tuple[Any, Any]:
+    policy, value = make_networks(config, OBSERVATION, ACTION, None)
+    apply_policy = jax.jit(lambda params, *args: policy.apply({"params": params}, *args)[0])
+    return apply_policy, jax.jit(lambda params, *args: value.apply({"params": params}, *args))
+
+
+def _fresh(state: ppo.LearnerState, lengths: np.ndarray, seed: int = 0) -> Trajectory:
+    """Trajectories that the state's own policy produces: rows of the given lengths, padded with zeros."""
+    rng = np.random.default_rng(seed)
+    policy, value = _networks(NETWORK)
+    observation = rng.normal(1.0, 2.0, (B, T, OBSERVATION)).astype(np.float32)
+    is_first = np.zeros((B, T), bool)
+    is_first[::3, 2] = True
+    mean, std = normalize.mean_std(state.normalizer)
+    action_mean = policy(state.policy_params, observation, None, is_first, mean, std)
+    log_std = state.policy_params["log_std"]
+    action = distributions.sample(jax.random.PRNGKey(seed), action_mean, log_std)
+    mask = np.arange(T) < lengths[:, None]
+    truncated = np.arange(T) == lengths[:, None] - 1
+    truncated[1::3] = False
+    terminated = (np.arange(T) == lengths[:, None] - 1) & ~truncated
+    steps = Trajectory(
+        observation=observation,
+        action=action,
+        log_prob=distributions.log_prob(action, action_mean, log_std),
+        value=value(state.value_params, observation, mean, std),
+        reward=rng.normal(size=(B, T)).astype(np.float32),
+        is_first=is_first,
+        terminated=terminated,
+        truncated=truncated,
+        bootstrap_value=truncated.astype(np.float32),
+        mask=mask,
+        initial_carry=np.zeros((B, T)),
+        policy_version=np.zeros((B, T)),
+    )
+    steps = jax.tree.map(lambda x: np.where(mask.reshape(B, T, *(1,) * (np.ndim(x) - 2)), x, 0).astype(x.dtype), steps)
+    return steps._replace(initial_carry=zero_carry(B, H), policy_version=np.zeros(B, np.int32))
+
+
+LENGTHS = np.array([6, 3, 5, 1, 6, 6, 2, 4, 6, 0, 5, 6, 3, 6, 6, 2])
+
+
+def _numbers(tree: Any) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def test_fresh_batch_has_ratio_one_also_after_the_normaliser_has_moved() -> None:
+    state, update = _learner(_config())
+    for seed in range(2):
+        state, metrics = update(state, _fresh(state, LENGTHS, seed))
+        np.testing.assert_allclose(metrics["ratio_first"], 1.0, atol=1e-5)
+        assert np.isfinite(_numbers(metrics)).all()
+        assert all(m.dtype == jnp.float32 for m in metrics.values())
+    assert float(metrics["policy_updates"]) > 0
+    assert int(state.update_count) == 2
+    assert int(state.env_steps) == 2 * LENGTHS.sum() == float(state.normalizer.count)
+
+
+def test_padding_cannot_change_anything() -> None:
+    results = []
+    for garbage in (0.0, 37.0):
+        state, update = _learner(_config())
+        trajectory = _fresh(state, LENGTHS)
+        names = [n for n in Trajectory._fields if n not in ("mask", "initial_carry", "policy_version")]
+        padding = ~trajectory.mask
+        filled = {n: getattr(trajectory, n).copy() for n in names}
+        for array in filled.values():
+            array[padding] = garbage
+        results.append(_numbers(update(state, trajectory._replace(**filled))))
+    for left, right in zip(*results, strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_padding_cannot_change_the_gradients() -> None:
+    config = _config()
+    state, _ = _learner(config)
+    policy, value = make_networks(config.network, OBSERVATION, ACTION, None)
+    statistics = normalize.mean_std(state.normalizer)
+
+    @jax.jit
+    def gradients(trajectory: Trajectory) -> Any:
+        batch, _ = ppo.prepare_batch(trajectory, config.ppo)
+        batch = batch._replace(trajectory=trajectory)  # garbage back in: the masks of the losses alone must do
+        actor = jax.grad(losses.policy_loss, has_aux=True)(state.policy_params, policy, batch, *statistics, config.ppo)
+        return actor, jax.value_and_grad(losses.value_loss)(state.value_params, value, batch, *statistics, config.ppo)
+
+    clean = _fresh(state, LENGTHS)
+    dirty = clean._replace(observation=np.where(clean.mask[..., None], clean.observation, 5.0).astype(np.float32))
+    for left, right in zip(_numbers(gradients(clean)), _numbers(gradients(dirty)), strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_one_device_and_eight_give_the_same_update() -> None:
+    """Sums over a batch are taken in another order on eight devices; Adam's first step, g / (|g| + 1e-5), magnifies
+    that rounding for gradients near zero, hence a tolerance of 1e-5 on parameters that move by 3e-4 per step."""
+    results = []
+    for devices in (1, 8):
+        state, update = _learner(_config(), devices)
+        state, metrics = update(state, _fresh(state, LENGTHS))
+        results.append((state, metrics))
+    for left, right in zip(*map(_numbers, results), strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-5)
+
+
+def test_same_seed_same_numbers_and_no_recompile() -> None:
+    results = []
+    for _ in range(2):
+        state, update = _learner(_config())
+        for seed in range(3):
+            state, metrics = update(state, _fresh(state, LENGTHS, seed))
+        assert update.trace_count == 1
+        assert update._jitted._cache_size() == 1
+        results.append(_numbers((state, metrics)))
+    for left, right in zip(*results, strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_mask_padding_false_dilutes_the_ratio_as_published() -> None:
+    config = _config(mask_padding=False)
+    state, _ = _learner(_config())
+    policy, _ = make_networks(config.network, OBSERVATION, ACTION, None)
+    batch, _ = ppo.prepare_batch(jax.tree.map(jnp.asarray, _fresh(state, LENGTHS)), config.ppo)
+    statistics = normalize.mean_std(state.normalizer)
+    _, metrics = jax.jit(lambda p: losses.policy_loss(p, policy, batch, *statistics, config.ppo))(state.policy_params)
+    at_zero = np.exp(distributions.log_prob(jnp.zeros(ACTION), jnp.zeros(ACTION), state.policy_params["log_std"]))
+    valid = LENGTHS.sum() / (B * T)
+    # The initial mean action is within about 0.01 of zero, which is the "action" of a padded step.
+    np.testing.assert_allclose(metrics["ratio_mean"], valid + (1 - valid) * at_zero, atol=1e-3)
+    assert float(metrics["ratio_mean"]) < 0.8
+    np.testing.assert_allclose(metrics["approx_kl"], 0.0, atol=1e-6)
+
+
+def test_max_kl_linear_schedule_and_fixed_deviation() -> None:
+    config = _config(
+        network={"learn_std": False}, max_kl=1e-7, policy_learning_rate=0.05, learning_rate_schedule="linear"
+    )
+    config = dataclasses.replace(config, total_env_steps=2 * int(LENGTHS.sum()))
+    state, update = _learner(config)
+    value_before, rates, applied = _numbers(state.value_params), [], []
+    for seed in range(3):
+        state, metrics = update(state, _fresh(state, LENGTHS, seed))
+        rates.append(float(metrics["learning_rate"]) / config.ppo.policy_learning_rate)
+        applied.append(float(metrics["policy_updates"]))
+    np.testing.assert_allclose(rates, [1.0, 0.5, 0.0], atol=1e-6)
+    assert not np.asarray(state.policy_params["log_std"]).any()
+    # One step of 0.05 exceeds the limit at once; with a rate of zero nothing moves and all four minibatches count.
+    assert applied == [1.0, 1.0, 4.0]
+    assert int(state.policy_opt_state[1].count) == 6
+    assert int(state.value_opt_state[1].count) == 12
+    assert any((x != y).any() for x, y in zip(value_before, _numbers(state.value_params), strict=True))
+
+
+def test_shapes_that_do_not_divide_are_refused() -> None:
+    state, update = _learner(_config(minibatch_trajectories=6))
+    with pytest.raises(ValueError, match="multiple of the minibatch"):
+        update(state, _fresh(state, LENGTHS))
+
+
+def test_export_names_and_types() -> None:
+    state, _ = _learner(_config())
+    exported = ppo.export_parameters(state)
+    policy = [f"lstm_{layer}_{kind}" for layer in (0, 1) for kind in ("input", "recurrent", "bias")]
+    policy += ["mean_kernel", "mean_bias", "log_std"]
+    value = [f"dense_{layer}_{kind}" for layer in (0, 1, 2) for kind in ("kernel", "bias")]
+    names = {f"policy/{n}" for n in policy} | {f"value/{n}" for n in value} | {"normalizer/mean", "normalizer/std"}
+    assert set(exported) == names
+    assert all(isinstance(x, np.ndarray) and x.dtype == np.float32 for x in exported.values())
+
+
+def test_learns_a_bandit_whose_best_action_depends_on_the_observation() -> None:
+    """Reward -|a - 0.5 sign(o)|^2, one step per episode; the best mean action is +-0.5."""
+    config = _config(
+        network={"initial_log_std": -0.7}, epochs=5, minibatch_trajectories=B, policy_learning_rate=5e-3, max_kl=0.0
+    )
+    state, update = _learner(config)
+    policy, _ = _networks(NETWORK)
+    rng = np.random.default_rng(0)
+
+    def play(state: ppo.LearnerState) -> tuple[Trajectory, float]:
+        rows, ones = B, np.ones((B, 1), bool)
+        observation = rng.choice([-1.0, 1.0], (rows, 1, OBSERVATION)).astype(np.float32)
+        mean = np.asarray(policy(state.policy_params, observation, None, None, *normalize.mean_std(state.normalizer)))
+        log_std = state.policy_params["log_std"]
+        action = mean + np.exp(np.asarray(log_std)) * rng.normal(size=mean.shape).astype(np.float32)
+        best = 0.5 * observation[..., :ACTION]
+        nothing = np.zeros((rows, 1), np.float32)
+        trajectory = Trajectory(
+            observation=observation,
+            action=action,
+            log_prob=distributions.log_prob(action, mean, log_std),
+            value=nothing,
+            reward=-np.sum((action - best) ** 2, -1),
+            is_first=ones,
+            terminated=ones,
+            truncated=~ones,
+            bootstrap_value=nothing,
+            mask=ones,
+            initial_carry=zero_carry(rows, H),
+            policy_version=np.zeros(rows, np.int32),
+        )
+        return trajectory, float(np.mean(np.sum((mean - best) ** 2, -1)))
+
+    trajectory, first_error = play(state)
+    for _ in range(30):
+        state, _ = update(state, trajectory)
+        trajectory, error = play(state)
+    assert error < 0.25 * first_error
