@@ -62,7 +62,7 @@ def save(
     Args:
       directory: holds one directory per step; created when missing.
       step: number of the step, 0 or more.
-      learner: the pytree to save.
+      learner: the state to save.
       extra: JSON-able values.
       blobs: opaque data, for example the workers' environments; may be empty, as may each of them.
       keep: steps that remain, at least 1.
@@ -143,11 +143,12 @@ def save_policy(path: Path, parameters: Mapping[str, np.ndarray], metadata: dict
       CheckpointError: it cannot be written; a file that was there before is untouched.
     """
     text = np.array(json.dumps(metadata))
-    digest = np.array(_digest(dict(parameters), {_POLICY_METADATA: text}))
+    digest = _digest(parameters, {_POLICY_METADATA: text})
+    arrays: dict[str, Any] = {_POLICY_METADATA: text, _POLICY_DIGEST: digest, **parameters}
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with open(partial, "wb") as file:
-            np.savez_compressed(file, **{_POLICY_METADATA: text, _POLICY_DIGEST: digest}, **parameters)
+            np.savez_compressed(file, **arrays)
         partial.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
@@ -162,8 +163,8 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
       CheckpointError: missing, not a policy file, or damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = dict(archive)
         text, digest = arrays.pop(_POLICY_METADATA), arrays.pop(_POLICY_DIGEST)
         if str(digest) != _digest(arrays, {_POLICY_METADATA: text}):
             raise _Damaged("its contents do not match their SHA-256 digest")
@@ -180,8 +181,7 @@ def _restore(path: Path, step: int, template: LearnerState) -> Loaded:
         raise _Damaged("its files do not match their SHA-256 digest")
     wanted = _named_leaves(template)
     with _quiet(), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
-        item = ocp.args.JsonRestore()
-        record = checkpointer.restore(path.absolute(), args=ocp.args.Composite(record=item)).record
+        record = checkpointer.restore(path.absolute(), args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
         saved = {name: (dtype, tuple(shape)) for name, (dtype, shape) in record["leaves"].items()}
         _check_same_network(path, saved, _signature(wanted))
         sizes = record["blob_sizes"]
@@ -257,8 +257,8 @@ def _digest_of_files(path: Path) -> str:
 def _saved(directory: Path) -> list[tuple[int, int, Path]]:
     """(step, attempt, path) of every complete step, oldest first."""
     paths = directory.iterdir() if directory.is_dir() else ()
-    matches = [(match, path) for path in paths if (match := _STEP_NAME.fullmatch(path.name))]
-    return sorted((int(match[1]), int(match[2] or 0), path) for match, path in matches)
+    found = [(match, path) for path in paths if (match := _STEP_NAME.fullmatch(path.name))]
+    return sorted((int(match[1]), int(match[2] or 0), path) for match, path in found)
 
 
 def _prune(directory: Path, step: int, path: Path, keep: int) -> None:
@@ -291,8 +291,7 @@ def _reason(error: BaseException) -> str:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Keeps the storage library's own messages off the terminal; failures arrive as exceptions."""
-    logger = logging.getLogger("absl")
-    level = logger.level
+    logger, level = logging.getLogger("absl"), logging.getLogger("absl").level
     logger.setLevel(logging.CRITICAL)
     try:
         yield

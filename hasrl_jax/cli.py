@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from hasrl_jax import config as config_module
+from hasrl_jax import config_checks
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.config import Config, ConfigError
 
@@ -32,7 +33,11 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
     known, rest = parser.parse_known_args(arguments)
     if known.config and known.resume:
         raise ConfigError("--config and --resume: give one of them; a resumed run brings its own configuration")
-    base = load_run_config(known.resume) if known.resume else config_module.load_yaml(known.config or config_module.DEFAULT_CONFIG)
+    base = (
+        load_run_config(known.resume)
+        if known.resume
+        else config_module.load_yaml(known.config or config_module.DEFAULT_CONFIG)
+    )
     config = override(base, rest, "train")
     if known.resume:
         config = config_module.from_dict({"run_dir": str(known.resume)}, config)
@@ -50,7 +55,7 @@ def override(base: Config, arguments: list[str], program: str) -> Config:
         description="Train a policy. Also: --config FILE, --resume DIR, --num-workers N.",
         config=(tyro.conf.FlagConversionOff,),
     )
-    config_module.check(config)
+    config_checks.check(config)
     return config
 
 

@@ -171,7 +171,11 @@ def evaluate(arguments: list[str]) -> None:
 
 def _readable(value: Any) -> str:
     if isinstance(value, dict):
-        return "none" if value["mean"] is None else f"{value['mean']:.3f}  (95 % {value['low']:.3f} to {value['high']:.3f})"
+        return (
+            "none"
+            if value["mean"] is None
+            else f"{value['mean']:.3f}  (95 % {value['low']:.3f} to {value['high']:.3f})"
+        )
     return f"{value:g}"
 
 

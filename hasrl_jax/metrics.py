@@ -126,6 +126,12 @@ class ProgressPrinter:
             self._bar.start()
             self._bar.console.show_cursor(True)  # a run that is killed must not leave the terminal without one
 
+    def __enter__(self) -> "ProgressPrinter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def update(self, record: Mapping[str, float | int | None]) -> None:
         """Shows a record as given to `MetricsWriter.write`."""
         env_steps = int(record.get("env_steps") or 0)

@@ -99,7 +99,9 @@ def random_states(task: Task, num_states: int, rng: np.random.Generator) -> EnvS
     for step in range(1, WARM_UP + 1):
         state, _ = envs.step(state, ACTION_SCALE * rng.standard_normal((num_states, task.action_size)), rng)
         pick = stop == step
-        chosen = jax.tree.map(lambda new, old: np.where(pick.reshape(-1, *[1] * (old.ndim - 1)), new, old), state, chosen)
+        chosen = jax.tree.map(
+            lambda new, old: np.where(pick.reshape(-1, *[1] * (old.ndim - 1)), new, old), state, chosen
+        )
     return chosen
 
 
@@ -160,7 +162,10 @@ def loop_errors(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         mujoco.mj_kinematics(model, data)
         for equality in connects:
             bodies, anchors = (model.eq_obj1id[equality], model.eq_obj2id[equality]), model.eq_data[equality, :6]
-            ends = [data.xpos[b] + data.xmat[b].reshape(3, 3) @ a for b, a in zip(bodies, anchors.reshape(2, 3), strict=True)]
+            ends = [
+                data.xpos[b] + data.xmat[b].reshape(3, 3) @ a
+                for b, a in zip(bodies, anchors.reshape(2, 3), strict=True)
+            ]
             errors[row] = max(errors[row], np.linalg.norm(ends[0] - ends[1]))
     return errors
 
@@ -174,7 +179,9 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
 
     running = ~(ended(reference)[before].any(axis=0) | ended(ours)[before].any(axis=0))
     running &= ~(reference.diverged[steps - 1] | ours.diverged[steps - 1])
-    first_ends = [np.where(ended(x)[:steps].any(axis=0), ended(x)[:steps].argmax(axis=0), -1) for x in (reference, ours)]
+    first_ends = [
+        np.where(ended(x)[:steps].any(axis=0), ended(x)[:steps].argmax(axis=0), -1) for x in (reference, ours)
+    ]
     alive = running & ~(ended(reference)[steps - 1] | ended(ours)[steps - 1])  # qpos of an ended one is a new episode's
 
     def summary(values: np.ndarray) -> dict[str, float]:
@@ -198,7 +205,9 @@ def to_markdown(report: dict[str, Any]) -> str:
     """The report of `measure` as a table: one row per quantity, largest and mean difference per horizon."""
     settings, horizons = report["settings"], report["horizons"]
     lines = [
-        "{task}, {states} states, MJX {impl} in {precision}, {steps_per_env_step} physics steps of {timestep_s:g} s".format(**settings)
+        "{task}, {states} states, MJX {impl} in {precision}, {steps_per_env_step} physics steps of {timestep_s:g} s".format(
+            **settings
+        )
         + " per environment step; largest (mean) absolute difference",
         "",
         "| quantity | " + " | ".join(f"{n} environment step{'s' if n != '1' else ''}" for n in horizons) + " |",

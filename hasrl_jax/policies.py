@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from hasrl_jax import checkpoint
+from hasrl_jax import checkpoint, config_checks
 from hasrl_jax import config as config_module
 from hasrl_jax.checkpoint import CheckpointError
 from hasrl_jax.collect.numpy_policy import parameter_shapes
@@ -53,7 +53,7 @@ def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
     parameters, metadata = checkpoint.load_policy(path)
     try:
         config = config_module.from_dict(metadata["config"])
-        config_module.check(config)
+        config_checks.check(config)
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: its configuration cannot be read: {error}") from None
     task = make_task(config)

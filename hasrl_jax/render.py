@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -105,10 +106,11 @@ def draw_text(image: np.ndarray, text: str) -> np.ndarray:
     picture = Image.fromarray(image)
     draw = ImageDraw.Draw(picture)
     margin = 8
-    for size in range(max(10, image.shape[0] // 24), 7, -1):
+    size = max(10, image.shape[0] // 24)
+    font = ImageFont.load_default(size)
+    while size > 8 and draw.textlength(text, font=font) > image.shape[1] - 2 * margin:
+        size -= 1
         font = ImageFont.load_default(size)
-        if draw.textlength(text, font=font) <= image.shape[1] - 2 * margin:
-            break
     draw.text((margin, margin), text, fill="white", font=font, stroke_width=2, stroke_fill="black")
     return np.asarray(picture)
 
@@ -157,11 +159,11 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     config = _config_to_film(config, known)
     config = cli.override(config, rest, "render")
     strip = known.strip or known.out.with_suffix(".png")
-    for path in (known.out, strip):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "ab"):  # fails now, and not after minutes of rendering
-            pass
     env = gymnasium_env.TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX)
+    for path in (known.out, strip):  # fail now, and not after minutes of rendering
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
     try:
         frames = max(1, round(known.seconds / env.task.env_step_s))
         push = Push(known.push, known.push_at)
@@ -177,8 +179,8 @@ def _config_to_film(config: "Config", known: argparse.Namespace) -> "Config":
     from hasrl_jax.envs.gymnasium_env import fixed_command
 
     env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
-    changes = {"cassie": {"randomize": {"enabled": False}}}
-    changes["collect"] = {"max_episode_steps": max(1, round(known.seconds / env_step_s)) + 1}
+    cap = max(1, round(known.seconds / env_step_s)) + 1
+    changes = {"cassie": {"randomize": {"enabled": False}}, "collect": {"max_episode_steps": cap}}
     return fixed_command(from_dict(changes, config), known.forward, known.lateral)
 
 

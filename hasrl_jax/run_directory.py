@@ -16,6 +16,7 @@ from typing import BinaryIO
 import yaml
 
 from hasrl_jax import config as config_module
+from hasrl_jax import config_checks
 from hasrl_jax.config import Config, ConfigError
 
 CONFIG_FILE = "config.yaml"
@@ -62,7 +63,7 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
             _require_no_run(path)
         _require_writable(path)
         if not resume:
-            _write_config(path / CONFIG_FILE, config)
+            write_config(path, config)
         yield RunDirectory(path)
 
 
@@ -87,7 +88,7 @@ def load_run_config(run_dir: Path) -> Config:
         raise RunError(f"{path}: damaged, or written by another version: {cut}")
     try:
         config = config_module.from_dict(values, where=CONFIG_FILE)
-        config_module.check(config)
+        config_checks.check(config)
     except ConfigError as error:
         raise RunError(f"{path}: damaged, or written by another version: {error}") from None
     return config
@@ -146,8 +147,13 @@ def _require_writable(path: Path) -> None:
         raise RunError(f"{place}: cannot be written: {_reason(error)}") from None
 
 
-def _write_config(path: Path, config: Config) -> None:
-    """All or nothing: a configuration cut short by a full disk would read as another one."""
+def write_config(run_dir: Path, config: Config) -> None:
+    """Writes config.yaml, all or nothing: one cut short by a full disk would read as another configuration.
+
+    Raises:
+      RunError: it cannot be written.
+    """
+    path = run_dir / CONFIG_FILE
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(config_module.dump_yaml(config), encoding="utf-8")

@@ -4,24 +4,25 @@ import logging
 import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
 import jax
-import numpy as np
 
 from hasrl_jax import checkpoint, cli
-from hasrl_jax.collect.cpu_pool import Collected, CpuPool, WorkerError
+from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.collect.plan import Plan, make_plan
+from hasrl_jax.collectors import CpuCollector
 from hasrl_jax.config import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.evaluate import run_episodes
 from hasrl_jax.learn import ppo
-from hasrl_jax.learn.batching import pad_segments
 from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record
-from hasrl_jax.run_directory import open_run
-from hasrl_jax.types import Trajectory
+from hasrl_jax.run_directory import open_run, write_config
 
 log = logging.getLogger("hasrl_jax")
 TEST_SEED = 1_000_003  # apart from every training stream
@@ -30,7 +31,7 @@ TEST_SEED = 1_000_003  # apart from every training stream
 class Progress(NamedTuple):
     """Where a run stands; saved with every checkpoint."""
 
-    iteration: int = 0  # iterations finished
+    iteration: int = 0  # iterations finished, which is also the version of the parameters
     env_steps: int = 0  # environment steps collected
     seconds: float = 0.0  # spent training
 
@@ -39,81 +40,62 @@ def train(config: Config, resume: bool = False) -> None:
     """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM."""
     task, plan, mesh = make_task(config), make_plan(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
-    learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
-    update = ppo.make_update(config, *sizes, mesh)
-    progress, worker_states = Progress(), []
-    with open_run(config, resume) as run, StopSignal() as stop:
+    with open_run(config, resume) as run, stop_signal() as stop:
+        learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
+        update = ppo.make_update(config, *sizes, mesh)
+        progress, env_states = Progress(), []
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
-            learner, progress, worker_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
-        announce(config, plan, task, str(run.path), progress)
-        with CpuPool(config, plan, task) as pool, MetricsWriter(run.path, progress.iteration) as writer:
-            printer = ProgressPrinter(config.total_env_steps, progress.env_steps)
-            pool.load(worker_states)
-            parameters = ppo.export_parameters(learner)
-            try:
-                while progress.env_steps < config.total_env_steps and not stop.requested:
-                    started = time.monotonic()
-                    if not pool.busy:
-                        pool.start(parameters, progress.iteration, version=progress.iteration)
-                    collected = pool.finish()
-                    enough = progress.env_steps + len(collected.fields["mask"]) >= config.total_env_steps
-                    if config.schedule == "overlap" and not enough and not stop.requested:
-                        pool.start(parameters, progress.iteration + 1, version=progress.iteration)
-                    update_started = time.monotonic()
-                    learner, result = update(learner, to_trajectory(collected, plan))
-                    parameters = ppo.export_parameters(learner)  # waits for the update to finish
-                    update_seconds = time.monotonic() - update_started
+            learner, progress, env_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
+            write_config(run.path, config)  # some settings may differ from now on
+        announce(config, plan, task, run.path, progress)
+        with (
+            CpuCollector(config, plan, task) as collector,
+            MetricsWriter(run.path, progress.iteration) as writer,
+            ProgressPrinter(config.total_env_steps, progress.env_steps) as printer,
+        ):
+            collector.load(env_states)
+            while progress.env_steps < config.total_env_steps and not stop:
+                started = time.monotonic()
+                if not collector.busy:
+                    collector.start(learner, progress.iteration, version=progress.iteration)
+                try:
+                    experience = collector.finish()
+                except WorkerError:
+                    save(config, run.checkpoints, progress, learner, [])
+                    raise
+                env_steps = progress.env_steps + experience.env_steps
+                if config.schedule == "overlap" and env_steps < config.total_env_steps and not stop:
+                    collector.start(learner, progress.iteration + 1, version=progress.iteration)
 
-                    record = iteration_record(collected, progress, {k: float(v) for k, v in result.items()})
-                    record |= {"update_seconds": update_seconds, "workers_lost": pool.workers_lost}
-                    progress = Progress(
-                        progress.iteration + 1,
-                        progress.env_steps + len(collected.fields["mask"]),
-                        progress.seconds + time.monotonic() - started,
-                    )
-                    if due(progress.iteration, config.evaluate.every_iterations) or enough:
-                        record |= test_record(config, task, parameters)
-                    record["env_steps_per_second"] = len(collected.fields["mask"]) / (time.monotonic() - started)
-                    writer.write(record)
-                    printer.update(record)
-                    if due(progress.iteration, config.checkpoint.every_iterations):
-                        save(config, run.checkpoints, progress, learner, pool)
-            finally:
-                save(config, run.checkpoints, progress, learner, pool)
-                printer.close()
+                update_started = time.monotonic()
+                learner, result = update(learner, experience.trajectory)
+                record: Record = {"iteration": progress.iteration + 1, "env_steps": env_steps, **experience.record}
+                record |= {name: float(value) for name, value in result.items()}  # waits for the update to finish
+                now = time.monotonic()
+                record |= {
+                    "policy_lag": progress.iteration - experience.version,
+                    "env_steps_per_second": experience.env_steps / (now - started),
+                    "update_seconds": now - update_started,
+                }
+                progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
+
+                last = env_steps >= config.total_env_steps
+                if due(progress.iteration, config.evaluate.every_iterations) or last:
+                    record |= test_record(config, task, learner)
+                writer.write(record)
+                printer.update(record)
+                if due(progress.iteration, config.checkpoint.every_iterations):
+                    save(config, run.checkpoints, progress, learner, [] if collector.busy else collector.save())
+            if not due(progress.iteration, config.checkpoint.every_iterations):
+                save(config, run.checkpoints, progress, learner, [] if collector.busy else collector.save())
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
 
 
-def to_trajectory(collected: Collected, plan: Plan) -> Trajectory:
-    """The centralised buffer as trajectories padded on the right, in whole minibatches (paper III.B)."""
-    rows = plan.rows * -(-len(collected.start) // plan.rows)
-    version = np.full(len(collected.start), collected.version, np.int32)
-    fields = collected.fields | {"initial_carry": collected.initial_carry, "policy_version": version}
-    return pad_segments(fields, collected.start, collected.end, plan.max_length, rows)
-
-
-def iteration_record(collected: Collected, progress: Progress, result: dict[str, float]) -> Record:
-    """What is known of an iteration before the evaluation, under the names of the metrics file."""
-    fields = collected.fields
-    ended = fields["episode_length"] > 0
-    terms = [statistics["reward_terms"] for statistics in collected.statistics]
-    return {
-        "iteration": progress.iteration + 1,
-        "env_steps": progress.env_steps + len(fields["mask"]),
-        "episode_return_train": float(fields["episode_return"][ended].mean()) if ended.any() else None,
-        "episode_length_train": float(fields["episode_length"][ended].mean()) if ended.any() else None,
-        **result,
-        "policy_lag": progress.iteration - collected.version,
-        "collect_seconds": collected.seconds,
-        "diverged_envs": sum(statistics["diverged"] for statistics in collected.statistics),
-        **{f"reward/{name}": float(np.mean([term[name] for term in terms])) for name in terms[0]},
-    }
-
-
-def test_record(config: Config, task: Task, parameters: dict[str, np.ndarray]) -> Record:
+def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:
     """Return and length of evaluation episodes with the mean action."""
     started = time.monotonic()
+    parameters = ppo.export_parameters(learner)
     episodes = run_episodes(config, task, parameters, config.evaluate.episodes, seed=TEST_SEED)
     return {
         "episode_return_test": float(episodes.episode_return.mean()),
@@ -122,17 +104,19 @@ def test_record(config: Config, task: Task, parameters: dict[str, np.ndarray]) -
     }
 
 
-def save(config: Config, directory, progress: Progress, learner: ppo.LearnerState, pool: CpuPool) -> None:
-    """A checkpoint; the environments' state is part of it unless they are collecting meanwhile."""
-    worker_states = [] if pool.busy else pool.save()
-    checkpoint.save(directory, progress.iteration, learner, progress._asdict(), worker_states, config.checkpoint.keep)
+def save(
+    config: Config, directory: Path, progress: Progress, learner: ppo.LearnerState, env_states: list[bytes]
+) -> None:
+    """A checkpoint with everything needed to continue."""
+    checkpoint.save(directory, progress.iteration, learner, progress._asdict(), env_states, config.checkpoint.keep)
 
 
 def due(iteration: int, every: int) -> bool:
+    """Whether something done every so many iterations (0: never) is to be done after this one."""
     return every > 0 and iteration % every == 0
 
 
-def announce(config: Config, plan: Plan, task: Task, run_dir: str, progress: Progress) -> None:
+def announce(config: Config, plan: Plan, task: Task, run_dir: Path, progress: Progress) -> None:
     """The first lines of a run: what runs where, and how fast the physics is sampled."""
     devices = ", ".join(str(device) for device in jax.devices())
     log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
@@ -144,33 +128,40 @@ def announce(config: Config, plan: Plan, task: Task, run_dir: str, progress: Pro
         1 / task.model.opt.timestep,
         1 / task.env_step_s,
     )
-    log.info("run directory %s%s", run_dir, f", continuing after iteration {progress.iteration}" if progress.iteration else "")
+    after = f", continuing after iteration {progress.iteration}" if progress.iteration else ""
+    log.info("run directory %s%s; compiling the learner takes some seconds", run_dir, after)
 
 
-class StopSignal:
+class Stop:
+    """True once a stop was requested."""
+
+    requested = False
+
+    def __bool__(self) -> bool:
+        return self.requested
+
+
+@contextmanager
+def stop_signal() -> Iterator[Stop]:
     """Turns the first Ctrl-C or SIGTERM into a request to stop after this iteration; the second acts at once."""
+    stop = Stop()
 
-    def __init__(self) -> None:
-        self.requested = False
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> "StopSignal":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._request)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _request(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+    def request(number: int, frame: FrameType | None) -> None:
+        if stop:
             raise KeyboardInterrupt
-        self.requested = True
+        stop.requested = True
         log.info("%s: finishing this iteration, then saving; once more stops at once", signal.Signals(number).name)
+
+    previous = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def main(argv: list[str] | None = None) -> int:
+    """The command line; returns the exit status."""
     cli.log_to_terminal()
     return cli.run(lambda: train(*cli.parse_train(sys.argv[1:] if argv is None else argv)))
 

@@ -5,6 +5,7 @@ through it but lie in shared memory, double-buffered by the parity of the iterat
 Source: paper section III.A and Figure 1.
 """
 
+import contextlib
 import json
 import logging
 import os
@@ -121,38 +122,55 @@ class CpuPool:
         """
         pending = set(range(self.plan.num_workers))
         statistics: dict[int, dict[str, Any]] = {}
+        cause: str | None = None
         while pending:
             by_connection = {self._workers[index].connection: index for index in pending}
             for ready in wait(list(by_connection), timeout=1.0):
                 index = by_connection[ready]
                 pending.discard(index)
-                message, cause = self._receive(index)
-                if cause is None and "error" not in message:
-                    statistics[index] = message
+                reply, failure = self._receive(index)
+                if failure is None:
+                    statistics[index] = json.loads(reply)
                     self._failures[index] = 0
                 else:
-                    self._replace(index, cause or f"raised\n{message['error']}")
-            pending -= self._replace_silent(pending)
+                    self._replace(index, failure)
+                    cause = failure
+            silent = self._replace_silent(pending)
+            pending -= silent
+            cause = self._silence() if silent else cause
         self.busy = False
         if not statistics:
-            raise WorkerError("every worker was lost in the same iteration; see the messages above")
+            raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
         return self._merge(statistics)
 
     def save(self) -> list[bytes]:
-        """The state of every worker's environments; only between `finish` and `start`."""
+        """The state of every worker's environments; only between `finish` and `start`.
+
+        A worker that is lost meanwhile is replaced and has an empty state, so its episodes begin anew.
+        """
         states = []
-        for index, worker in enumerate(self._workers):
+        for index in range(self.plan.num_workers):
             self._send(index, {"do": "save"})
-            states.append(worker.connection.recv_bytes())
+            state, failure = self._answer(index)
+            states.append(state)
+            if failure is not None:
+                self._replace(index, failure)
         return states
 
     def load(self, states: list[bytes]) -> None:
-        """Restores what `save` returned, when the number of workers is the same."""
+        """Restores what `save` returned; environments that differ in number begin new episodes instead."""
+        if len(states) != self.plan.num_workers:
+            if states:
+                log.warning("%d workers saved, %d run: all episodes begin anew", len(states), self.plan.num_workers)
+            return
         for index, state in enumerate(states):
             self._send(index, {"do": "load"})
-            self._workers[index].connection.send_bytes(state)
-            if state:
-                self._workers[index].connection.recv_bytes()
+            self._send(index, state)
+            reply, failure = self._answer(index)
+            if failure is not None:
+                self._replace(index, failure)
+            elif state and not json.loads(reply)["loaded"]:
+                log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
 
     def close(self) -> None:
         """Ends all workers and frees the shared memory."""
@@ -174,7 +192,7 @@ class CpuPool:
             env=os.environ | ONE_THREAD,
         )
         theirs.close()
-        setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid(), "num_workers": self.plan.num_workers}
+        setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}
         ours.send_bytes(json.dumps(setup).encode())
         return _Worker(process, ours)
 
@@ -183,45 +201,63 @@ class CpuPool:
         worker = self._workers[index]
         if not worker.connection.poll(timeout):
             raise WorkerError(f"worker {index} did not start within collect.worker_start_timeout_s={timeout:g} s")
-        message, cause = self._receive(index)
-        if cause or "error" in message:
-            raise WorkerError(f"worker {index} did not start: {cause or message['error']}")
+        _, failure = self._receive(index)
+        if failure is not None:
+            raise WorkerError(f"worker {index} did not start: it {failure}")
 
-    def _send(self, index: int, message: dict[str, Any]) -> None:
-        try:
-            self._workers[index].connection.send_bytes(json.dumps(message).encode())
-        except OSError:
-            pass  # it died; its closed connection says so when the reply is awaited
+    def _send(self, index: int, message: dict[str, Any] | bytes) -> None:
+        data = message if isinstance(message, bytes) else json.dumps(message).encode()
+        with contextlib.suppress(OSError):  # it died; its closed connection says so when the reply is awaited
+            self._workers[index].connection.send_bytes(data)
 
-    def _receive(self, index: int) -> tuple[dict[str, Any], str | None]:
-        """The worker's message and, when it died instead, how."""
+    def _answer(self, index: int) -> tuple[bytes, str | None]:
+        """As `_receive`, for a request that is answered at once: a worker that stays silent has failed."""
+        if not self._workers[index].connection.poll(self.config.collect.worker_timeout_s):
+            return b"", self._silence()
+        return self._receive(index)
+
+    def _receive(self, index: int) -> tuple[bytes, str | None]:
+        """The worker's message, empty if it failed, and how it failed if it did."""
         worker = self._workers[index]
         try:
-            return json.loads(worker.connection.recv_bytes()), None
+            data = worker.connection.recv_bytes()
         except (EOFError, OSError):
             code = worker.process.wait()
-            return {}, f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
+            return b"", f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
+        if data.startswith(b'{"error"'):
+            return b"", f"raised\n{json.loads(data)['error']}"
+        return data, None
+
+    def _silence(self) -> str:
+        return f"was silent for collect.worker_timeout_s={self.config.collect.worker_timeout_s:g} s"
 
     def _replace_silent(self, pending: set[int]) -> set[int]:
         """Replaces workers without a heartbeat; returns their indices."""
         limit = self.config.collect.worker_timeout_s
         silent = {index for index in pending if time.monotonic() - self._block.heartbeat[index] > limit}
         for index in silent:
-            self._replace(index, f"was silent for collect.worker_timeout_s={limit:g} s")
+            self._replace(index, self._silence())
         return silent
 
     def _replace(self, index: int, cause: str) -> None:
-        old = self._workers[index]
-        log.warning("worker %d (process %d) %s; its part of this iteration is lost, starting another", index, old.process.pid, cause)
-        old.connection.close()
-        old.process.kill()
-        old.process.wait()
-        self.workers_lost += 1
-        self._failures[index] += 1
-        if self._failures[index] >= MAX_FAILURES:
-            raise WorkerError(f"worker {index} failed {MAX_FAILURES} times in a row; the last one {cause}")
-        self._workers[index] = self._spawn(index)
-        self._await_ready(index)
+        """Starts another worker in place of a lost one, more than once if the new one does not start either."""
+        while True:
+            old = self._workers[index]
+            lost = "its part of this iteration is lost, starting another"
+            log.warning("worker %d (process %d) %s; %s", index, old.process.pid, cause, lost)
+            old.connection.close()
+            old.process.kill()
+            old.process.wait()
+            self.workers_lost += 1
+            self._failures[index] += 1
+            if self._failures[index] >= MAX_FAILURES:
+                raise WorkerError(f"worker {index} failed {MAX_FAILURES} times in a row; the last one {cause}")
+            self._workers[index] = self._spawn(index)
+            try:
+                self._await_ready(index)
+                return
+            except WorkerError as error:
+                cause = f"was replaced in vain: {error}"
 
     def _merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
         """Copies the slots into one buffer and shifts their start and end indices accordingly."""
@@ -229,11 +265,9 @@ class CpuPool:
         finished = [slots[index] for index in sorted(statistics)]
         counts = [int(slot["num_segments"][0]) for slot in finished]
         offsets = [position * self.plan.steps_per_worker for position in range(len(finished))]
-        per_segment = ("start", "end", "initial_carry", "num_segments")
+        per_step = finished[0].keys() - {"start", "end", "initial_carry", "num_segments"}
         return Collected(
-            fields={
-                name: np.concatenate([slot[name] for slot in finished]) for name in finished[0] if name not in per_segment
-            },
+            fields={name: np.concatenate([slot[name] for slot in finished]) for name in sorted(per_step)},
             start=np.concatenate([s["start"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
             end=np.concatenate([s["end"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
             initial_carry=np.concatenate([s["initial_carry"][:n] for s, n in zip(finished, counts, strict=True)]),

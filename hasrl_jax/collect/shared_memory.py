@@ -4,6 +4,7 @@ The block has no name: its file descriptor is inherited by the workers, so it va
 process that holds it, however that process ends. Nothing can be left behind.
 """
 
+import contextlib
 import mmap
 import os
 import tempfile
@@ -121,7 +122,8 @@ class Block:
     def close(self) -> None:
         """Lets go of the memory; the arrays must not be used afterwards."""
         self.heartbeat, self.parameters, self.slots = np.empty(0), [], []
-        self._memory.close()
+        with contextlib.suppress(BufferError):  # an exception under way may still hold an array; it goes with that
+            self._memory.close()
         os.close(self.descriptor)
 
 

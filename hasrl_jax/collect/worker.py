@@ -42,7 +42,9 @@ class Actor:
         self.state: EnvState | None = None
         self.carry = np.zeros((plan.envs_per_worker, *plan.carry_shape), np.float32)
 
-    def collect(self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], iteration: int, beat: Any) -> dict:
+    def collect(
+        self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], iteration: int, beat: Any
+    ) -> dict[str, Any]:
         """Fills `slot` with `steps_per_env` steps of every environment; returns statistics.
 
         Steps are stored by environment, then time: index = env * steps_per_env + t.
@@ -63,7 +65,9 @@ class Actor:
             if name not in ("initial_carry", "start", "end", "num_segments")
         }
         unroll_carries = []
-        sums = {"reward_terms": np.zeros(len(self.task.reward_terms)), "diverged": 0}
+        sums: dict[str, Any] = {"diverged": 0, "inference": 0.0, "environment": 0.0}
+        sums["reward_terms"] = np.zeros(len(self.task.reward_terms))
+        physics_before = self.envs.physics_seconds
         for t in range(horizon):
             if t % self.plan.max_length == 0:
                 unroll_carries.append(np.where(self.state.is_first[:, None, None, None], np.float32(0), self.carry))
@@ -73,11 +77,21 @@ class Actor:
         self._index_segments(slot, by_env, unroll_carries)
         valid = max(int(by_env["mask"].sum()), 1)
         terms = dict(zip(self.task.reward_terms, (sums["reward_terms"] / valid).tolist(), strict=True))
-        return {"reward_terms": terms, "diverged": int(sums["diverged"])}
+        physics = self.envs.physics_seconds - physics_before
+        return {
+            "reward_terms": terms,
+            "diverged": int(sums["diverged"]),
+            "physics_cpu_seconds": physics,
+            "inference_cpu_seconds": sums["inference"],
+            "environment_cpu_seconds": sums["environment"] - physics,  # observation, reward and reset
+        }
 
-    def _step(self, parameters: numpy_policy.Parameters, by_env: dict, t: int, rng: np.random.Generator, sums: dict) -> None:
+    def _step(
+        self, parameters: numpy_policy.Parameters, by_env: dict, t: int, rng: np.random.Generator, sums: dict[str, Any]
+    ) -> None:
         """One environment step of every environment, written to column `t`."""
         state = self.state
+        cpu_start = time.process_time()
         inputs = numpy_policy.streams(state.observation, parameters, self.mirror)
         mean, self.carry = numpy_policy.policy_step(parameters, inputs, self.carry, state.is_first, self.mirror)
         log_std = numpy_policy.log_std(parameters, self.mirror)
@@ -89,7 +103,10 @@ class Actor:
         by_env["log_prob"][:, t] = numpy_policy.log_prob(noise, log_std)
         by_env["value"][:, t] = numpy_policy.value(parameters, inputs)
         returns_before, steps_before = state.episode_return, state.episode_step
+        cpu_acted = time.process_time()
         self.state, result = self.envs.step(state, action, rng)
+        sums["inference"] += cpu_acted - cpu_start
+        sums["environment"] += time.process_time() - cpu_acted
 
         valid = ~result.diverged
         by_env["reward"][:, t] = np.where(valid, result.reward, 0.0)
@@ -117,7 +134,8 @@ class Actor:
         in_unrolls = self.config.collect.mode == "unrolls"
         last = np.arange(unroll - 1, horizon, unroll) if in_unrolls else np.array([horizon - 1])
         inputs = numpy_policy.streams(self.state.observation, parameters, self.mirror)
-        following = np.concatenate([by_env["value"][:, last[:-1] + 1], numpy_policy.value(parameters, inputs)[:, None]], axis=1)
+        final = numpy_policy.value(parameters, inputs)
+        following = np.concatenate([by_env["value"][:, last[:-1] + 1], final[:, None]], axis=1)
         cut = ~by_env["terminated"][:, last] & ~by_env["truncated"][:, last] & by_env["mask"][:, last]
         by_env["truncated"][:, last] |= cut
         by_env["bootstrap_value"][:, last] = np.where(cut, following, by_env["bootstrap_value"][:, last])
@@ -151,11 +169,11 @@ class Actor:
         np.savez(buffer, carry=self.carry, **arrays)
         return buffer.getvalue()
 
-    def load(self, data: bytes) -> None:
-        """Restores what `save` returned."""
-        if not data:
-            return
-        arrays = dict(np.load(io.BytesIO(data), allow_pickle=False))
+    def load(self, data: bytes) -> bool:
+        """Restores what `save` returned; False, and nothing changes, when that was nothing or for other sizes."""
+        arrays = dict(np.load(io.BytesIO(data), allow_pickle=False)) if data else {}
+        if not data or arrays["carry"].shape != self.carry.shape:
+            return False
         self.carry = arrays.pop("carry")
         rng = np.random.Generator(np.random.Philox(0))
         template = self.task.reset(rng.random((1, self.task.reset_uniforms)), np)
@@ -163,6 +181,7 @@ class Actor:
         fields = {name: arrays.pop(f"model/{name}") for name in template.model_fields}
         self.state = EnvState(task=task_state, model_fields=fields, **arrays)
         self.envs.restore(self.state)
+        return True
 
 
 def serve(connection: Connection, descriptor: int) -> None:
@@ -186,14 +205,14 @@ def serve(connection: Connection, descriptor: int) -> None:
         if message["do"] == "collect":
             iteration = message["iteration"]
             buffer = iteration % shared_memory.NUM_BUFFERS
-            cpu = time.process_time()
+            cpu, wall = time.process_time(), time.monotonic()
             statistics = actor.collect(block.parameters[buffer], block.slots[buffer][index], iteration, beat)
-            reply(connection, statistics | {"cpu_seconds": time.process_time() - cpu})
+            spent = {"cpu_seconds": time.process_time() - cpu, "seconds": time.monotonic() - wall}
+            reply(connection, statistics | spent)
         elif message["do"] == "save":
             connection.send_bytes(actor.save())
         elif message["do"] == "load":
-            actor.load(connection.recv_bytes())
-            reply(connection, {"loaded": True})
+            reply(connection, {"loaded": actor.load(connection.recv_bytes())})
 
 
 def reply(connection: Connection, message: dict) -> None:
@@ -209,7 +228,8 @@ def _die_with_parent(parent: int) -> None:
 
 
 def main() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the pool decides what to do
+    for number in (signal.SIGINT, signal.SIGTERM):  # they reach the whole group; the pool decides what to do
+        signal.signal(number, signal.SIG_IGN)
     mujoco.set_mju_user_warning(lambda text: None)  # divergence is counted, not written to a log file
     connection = Connection(int(sys.argv[1]))
     try:

@@ -119,7 +119,9 @@ def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
     return xp.concatenate([sensordata[..., ids.foot_force], error], axis=-1)
 
 
-def step(constants: Constants, state: CassieState, action: Array, reading: Reading, uniforms: Array, xp: Any) -> Transition:
+def step(
+    constants: Constants, state: CassieState, action: Array, reading: Reading, uniforms: Array, xp: Any
+) -> Transition:
     """Reward, termination and next observation of the environment step that `reading` ends."""
     config, ids = constants.config, constants.ids
     quat = reading.qpos[..., 3:7]
@@ -171,7 +173,13 @@ def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, 
 
 
 def reward_errors(
-    constants: Constants, state: CassieState, action: Array, reading: Reading, acceleration: Array, path_y: Array, xp: Any
+    constants: Constants,
+    state: CassieState,
+    action: Array,
+    reading: Reading,
+    acceleration: Array,
+    path_y: Array,
+    xp: Any,
 ) -> dict[str, Array]:
     """The scores and errors of paper Table I by term name, each [...]."""
     config, ids = constants.config, constants.ids

@@ -5,6 +5,7 @@ is copying arrays. Randomness comes in as a NumPy generator; the environments ho
 """
 
 import copy
+import time
 from typing import Any, NamedTuple
 
 import mujoco
@@ -54,6 +55,7 @@ class CpuEnvs:
         self.task = task
         self.max_episode_steps = max_episode_steps
         self.num_envs = num_envs
+        self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
         self._models = [copy.copy(task.model) for _ in range(num_envs)]
         self._data = mujoco.MjData(task.model)
         self._rollout = rollout.Rollout(nthread=0)  # on the calling thread: one core per worker
@@ -120,6 +122,7 @@ class CpuEnvs:
         """Runs the physics steps of one environment step; also says which simulations diverged, [E] bool."""
         task, model = self.task, self.task.model
         self._controls[:] = control[:, None]
+        cpu = time.process_time()
         self._rollout.rollout(
             self._models,
             [self._data],
@@ -131,6 +134,7 @@ class CpuEnvs:
             state=self._states,
             sensordata=self._sensordata,
         )
+        self.physics_seconds += time.process_time() - cpu
         end = self._states[:, -1]
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
         timestep = state.model_fields.get("timestep", model.opt.timestep)

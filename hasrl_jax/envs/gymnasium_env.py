@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from hasrl_jax import config as config_module
+from hasrl_jax import config_checks
 from hasrl_jax.config import Config, ConfigError
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
 from hasrl_jax.envs.registration import register
@@ -81,7 +82,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         shadow_px: int | None = None,
     ):
         self.config = Config() if config is None else config
-        config_module.check(self.config)
+        config_checks.check(self.config)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode: got {render_mode!r}; expected None or 'rgb_array'")
         self.render_mode = render_mode
@@ -157,11 +158,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise RuntimeError("nothing to render: call reset() first")
         if self._renderer is None:
             self._renderer = self._make_renderer()
-        model, data = self._renderer.model, self._render_data
-        data.qpos[:] = self._physics[1 : 1 + model.nq]
-        mujoco.mj_forward(model, data)
-        self._renderer.update_scene(data, self._camera)
-        return self._renderer.render()
+        renderer, data = self._renderer, self._render_data
+        data.qpos[:] = self._physics[1 : 1 + renderer.model.nq]
+        mujoco.mj_forward(renderer.model, data)
+        renderer.update_scene(data, self._camera)
+        return renderer.render()
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -179,7 +180,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"push: task {self.task.name!r} has no floating robot")
         if self._state is None or self._ended:
             raise RuntimeError("no episode is running: call reset() first")
-        mass = self._state.model_fields.get("body_mass", self.task.model.body_mass[None]).sum()
+        mass = self._state.model_fields.get("body_mass", np.asarray(self.task.model.body_mass)).sum()
         physics = self._state.physics.copy()
         # The first two degrees of freedom translate all bodies together, so their momentum is mass times velocity.
         velocity = 1 + self.task.model.nq
@@ -203,7 +204,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if command.shape != (2,) or not np.isfinite(command).all():
             raise ValueError(f"options['command']: got {options['command']!r}; expected two finite speeds in m/s")
         config = fixed_command(self.config, *command.tolist())
-        config_module.check(config)
+        config_checks.check(config)
         return config
 
     def _make_renderer(self) -> mujoco.Renderer:
@@ -215,6 +216,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             model.vis.quality.shadowsize = self._shadow_px
         # The floor acts everywhere but is drawn to its size: draw it endless, or a robot walks off it.
         model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0
+        model.mat_reflectance[:] = 0  # reflections draw the scene twice, which software rendering pays in full
+        model.vis.map.shadowclip = 3  # the edge of the shadow map speckles the floor; put it out of sight
         self._render_data = mujoco.MjData(model)
         try:
             renderer = mujoco.Renderer(model, height, width)

@@ -21,6 +21,8 @@ from hasrl_jax.types import Array
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional Warp is missing
     from mujoco import mjx
 
+    from hasrl_jax.envs.mjx_physics import Loops, find_loops, physics_step
+
 LARGEST = mujoco.mjMAXVAL  # C MuJoCo, too, gives up a simulation that holds a larger number
 # Bits of the overflow word of MuJoCo Warp: broad phase, narrow phase and collision detection; constraint rows and
 # their non-zeros. The other bits do not concern limits that can be configured.
@@ -53,6 +55,7 @@ class MjxEngine:
     max_episode_steps: int
     model: mjx.Model  # the nominal robot
     data: mjx.Data  # blank: a physics step overwrites all that matters
+    loops: Loops
 
     def reset(self, key: Array) -> MjxEnvState:
         """A fresh episode. `key`: [2] uint32; the environment draws everything from it, now and later."""
@@ -130,15 +133,15 @@ class MjxEngine:
         """The physics steps of one environment step under constant control [nu]; also the overflow flags [2]."""
         task, model = self.task, _with_fields(self.model, state.model_fields)
 
-        def physics_step(carry: tuple, _: None) -> tuple[tuple, None]:
+        def advance_and_sum(carry: tuple, _: None) -> tuple[tuple, None]:
             data, total = carry
-            data = mjx.step(model, data)
+            data = physics_step(model, data, self.loops)
             return (self._keep(data), total + task.physics_features(data.sensordata, jnp)), None
 
         # Like the C engine, every environment step starts from a zero warm start, so its state is qpos and qvel.
         data = self.data.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control)
         total = jnp.zeros_like(task.physics_features(data.sensordata, jnp))
-        (data, total), _ = jax.lax.scan(physics_step, (data, total), None, length=task.steps_per_env_step)
+        (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), None, length=task.steps_per_env_step)
         return Reading(data.qpos, data.qvel, data.sensordata, total / task.steps_per_env_step), _overflow(data)
 
     def _keep(self, data: mjx.Data) -> mjx.Data:
@@ -182,12 +185,15 @@ def make_engine(
     try:
         model = mjx.put_model(task.model, impl=impl)
     except NotImplementedError as error:
-        raise ConfigError(f"mjx.impl: {impl} cannot run the model of task {task.name} ({error}); set backend to cpu_pool") from None
+        raise ConfigError(
+            f"mjx.impl: {impl} cannot run the model of task {task.name} ({error}); set backend to cpu_pool"
+        ) from None
+    loops = find_loops(task.model)
     if impl == "jax":
-        return MjxEngine(task, max_episode_steps, model, mjx.make_data(model, impl=impl))
+        return MjxEngine(task, max_episode_steps, model, mjx.make_data(model, impl=impl), loops)
     model = model.tree_replace({"opt._impl.warn_overflow": 0})  # counted here, not printed
     data = mjx.make_data(task.model, impl=impl, naconmax=num_envs * contacts_per_env, njmax=constraints_per_env)
-    return MjxEngine(task, max_episode_steps, model, data)
+    return MjxEngine(task, max_episode_steps, model, data, loops)
 
 
 def _warp_installed() -> bool:

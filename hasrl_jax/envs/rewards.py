@@ -45,7 +45,13 @@ def quaternion_error(quat: Array, reference: Array, xp: Any) -> Array:
 
 
 def pelvis_motion(
-    lateral_m: Array, height_m: Array, speed: Array, angular_velocity: Array, acceleration: Array, config: RewardConfig, xp: Any
+    lateral_m: Array,
+    height_m: Array,
+    speed: Array,
+    angular_velocity: Array,
+    acceleration: Array,
+    config: RewardConfig,
+    xp: Any,
 ) -> Array:
     """P_m: lateral drift, height error beyond a band that widens with speed, rotation and acceleration.
 
@@ -70,8 +76,6 @@ def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> A
     `errors` holds the two scores S_F and S_V under `foot_force` and `foot_velocity`, and for every
     other term the non-negative error E whose exp(-E) is rewarded.
     """
-    values = [
-        errors[name] if name in ("foot_force", "foot_velocity") else xp.exp(-errors[name]) for name in TERMS
-    ]
+    values = [errors[name] if name in ("foot_force", "foot_velocity") else xp.exp(-errors[name]) for name in TERMS]
     weights = [config.scale * getattr(config, name) for name in TERMS]
     return xp.stack([weight * value for weight, value in zip(weights, values, strict=True)], axis=-1)

@@ -4,8 +4,6 @@ The parameters are flat dictionaries with explicit names, so that a collector ca
 arrays alone, without this module.
 """
 
-from typing import Any, NamedTuple
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -13,26 +11,10 @@ import numpy as np
 
 from hasrl_jax.config import NetworkConfig
 from hasrl_jax.learn.lstm import GATES, lstm_layer
+from hasrl_jax.types import Mirror
 
 LSTM_LAYERS = 2
 OBSERVATION_CLIP = 10.0  # bound of a normalised observation, in standard deviations
-
-
-class Mirror(NamedTuple):
-    """Left-right reflection of the robot as two signed permutations: (M x)[k] = sign[k] * x[index[k]]."""
-
-    observation_index: Any  # [O] int
-    observation_sign: Any  # [O] +1 or -1
-    action_index: Any  # [A] int
-    action_sign: Any  # [A] +1 or -1
-
-    def observation(self, observation: jax.Array) -> jax.Array:
-        """The mirrored observation, [..., O]."""
-        return observation[..., np.asarray(self.observation_index)] * np.asarray(self.observation_sign, np.float32)
-
-    def action(self, action: jax.Array) -> jax.Array:
-        """The mirrored action, [..., A]."""
-        return action[..., np.asarray(self.action_index)] * np.asarray(self.action_sign, np.float32)
 
 
 def check_mirror(mirror: Mirror, observation_size: int, action_size: int) -> None:

@@ -16,8 +16,8 @@ from hasrl_jax.config import Config, PPOConfig
 from hasrl_jax.learn import normalize, returns
 from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS, minibatch_indices
 from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, value_loss
-from hasrl_jax.learn.networks import Mirror, Policy, Value, make_networks
-from hasrl_jax.types import Trajectory
+from hasrl_jax.learn.networks import Policy, Value, make_networks
+from hasrl_jax.types import Mirror, Trajectory
 
 Trained = tuple[Parameters, Any]  # parameters and their optimiser state
 

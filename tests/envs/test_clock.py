@@ -14,7 +14,7 @@ PHASE = np.linspace(0, 1, 2001, endpoint=False)
 
 
 def _spline(speed: float) -> tuple[PchipInterpolator, PchipInterpolator]:
-    """Left and right force clock over three cycles, time in units of a cycle, through the inner edges of each interval."""
+    """Left and right force clock through the inner edges of each interval, over three cycles of length 1."""
     swing = (0.30 + 0.40 / 3 * abs(speed)) / 2
     stance = (0.70 - 0.40 / 3 * abs(speed)) / 2
     lengths = np.tile([swing, stance, swing, stance], 3)

@@ -1,0 +1,119 @@
+"""`bench learner`: seconds per PPO update, for the paper's sizes and for the project's defaults."""
+
+import argparse
+import statistics
+import time
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from hasrl_jax.bench.report import format_table
+from hasrl_jax.config import Config
+from hasrl_jax.learn import ppo
+from hasrl_jax.types import Trajectory
+
+OBSERVATION_SIZE, ACTION_SIZE = 50, 10  # of Cassie
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the learner benchmark."""
+    parser.add_argument("--sizes", choices=("paper", "default", "both"), default="both")
+    parser.add_argument("--updates", type=int, default=5, help="measured updates, after two that warm up")
+
+
+def measure(arguments: argparse.Namespace) -> dict:
+    """Both presets, or one."""
+    names = ["paper", "default"] if arguments.sizes == "both" else [arguments.sizes]
+    return {"cells": [{"sizes": name, **measure_cell(*sizes(name), arguments.updates)} for name in names]}
+
+
+def sizes(name: str) -> tuple[Config, int, int]:
+    """Configuration, trajectories and steps per trajectory of one update.
+
+    `paper` is 100 trajectories of 100 steps in one minibatch, hidden 256, 10 epochs. Policy steps are never skipped,
+    so that every update does the same work.
+    """
+    config = Config()
+    collect = config.collect
+    if name == "default":
+        rows = collect.env_steps_per_iteration // collect.unroll_length
+        return replace(config, ppo=replace(config.ppo, max_kl=0.0)), rows, collect.unroll_length
+    network = replace(config.network, hidden_size=256, normalize_observations=False)
+    settings = replace(config.ppo, epochs=10, minibatch_trajectories=100, max_kl=0.0)
+    return replace(config, network=network, ppo=settings), 100, 100
+
+
+def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
+    """Compiles, warms up, and times single updates on the same random trajectories."""
+    shapes = (OBSERVATION_SIZE, ACTION_SIZE, None)
+    learner = ppo.init_learner(config, *shapes, jax.random.key(config.seed))
+    update = ppo.make_update(config, *shapes, ppo.make_mesh())
+    trajectory = random_trajectory(config, rows, steps)
+    seconds = []
+    for _ in range(updates + 2):
+        started = time.perf_counter()
+        learner, metrics = update(learner, trajectory)
+        jax.block_until_ready((learner, metrics))
+        seconds.append(time.perf_counter() - started)
+    measured = seconds[2:]
+    median = statistics.median(measured)
+    return {
+        "trajectories": rows,
+        "steps": steps,
+        "hidden": config.network.hidden_size,
+        "epochs": config.ppo.epochs,
+        "minibatch_trajectories": config.ppo.minibatch_trajectories,
+        "seconds_per_update": median,
+        "seconds_fastest": min(measured),
+        "env_steps_per_second": rows * steps / median,
+        "compile_seconds": seconds[0] - median,
+        "recompiles": update.trace_count - 1,
+    }
+
+
+def random_trajectory(config: Config, rows: int, steps: int) -> Trajectory:
+    """Full trajectories of noise, each cut by the time limit at its end."""
+    rng = np.random.default_rng(config.seed)
+
+    def noise(*shape: int) -> np.ndarray:
+        return rng.standard_normal((rows, *shape), np.float32)
+
+    first, last = np.zeros((2, rows, steps), bool)
+    first[:, 0], last[:, -1] = True, True
+    action = noise(steps, ACTION_SIZE)
+    log_prob = -0.5 * np.sum(action**2 + np.log(2 * np.pi), axis=-1, dtype=np.float32)
+    return Trajectory(
+        observation=noise(steps, OBSERVATION_SIZE),
+        action=action,
+        log_prob=log_prob.astype(np.float32),
+        value=noise(steps),
+        reward=noise(steps),
+        is_first=first,
+        terminated=np.zeros((rows, steps), bool),
+        truncated=last,
+        bootstrap_value=noise(steps) * last,
+        mask=np.ones((rows, steps), bool),
+        initial_carry=np.zeros((rows, 2, 2, config.network.hidden_size), np.float32),
+        policy_version=np.zeros(rows, np.int32),
+    )
+
+
+def tables(figures: dict) -> str:
+    """One row per preset."""
+    headers = ["sizes", "batch x steps", "hidden", "epochs", "minibatch", "s/update", "best", "compile s", "recompiles"]
+    rows = [
+        [
+            cell["sizes"],
+            f"{cell['trajectories']} x {cell['steps']}",
+            cell["hidden"],
+            cell["epochs"],
+            cell["minibatch_trajectories"],
+            cell["seconds_per_update"],
+            cell["seconds_fastest"],
+            cell["compile_seconds"],
+            cell["recompiles"],
+        ]
+        for cell in figures["cells"]
+    ]
+    return format_table(headers, rows)

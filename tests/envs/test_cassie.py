@@ -1,0 +1,251 @@
+"""The Cassie task: what the observation holds, symmetry, commands, termination, and NumPy against JAX."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from hasrl_jax.config import Config, from_dict
+from hasrl_jax.envs import cassie
+from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.envs.task import Reading, Task
+
+MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")
+PASSIVE = ("shin", "tarsus", "foot")
+NOMINAL_ROBOT = {"randomize": {"enabled": False}}
+
+
+def _make(**changes: dict) -> tuple[Task, cassie.Constants]:
+    task = cassie.make(from_dict({"cassie": changes}))
+    return task, task.step.args[0]
+
+
+def _moving_state(steps: int = 6, seed: int = 0, **changes: dict) -> tuple[Task, CpuEnvs, EnvState, np.ndarray]:
+    """One environment in the middle of an episode under random actions, and an action."""
+    task, _ = _make(**changes)
+    envs = CpuEnvs(task, 1, 1000)
+    rng = np.random.default_rng(seed)
+    state = envs.reset(rng)
+    for _ in range(steps):
+        state, result = envs.step(state, rng.uniform(-0.3, 0.3, (1, 10)), rng)
+        assert not (result.terminated | result.diverged).any()
+    return task, envs, state, rng.uniform(-0.3, 0.3, (1, 10))
+
+
+def _still_reading(task: Task, qpos: np.ndarray) -> Reading:
+    """A robot that does not move, with sensors that read nothing."""
+    sizes = (task.model.nv, task.model.nsensordata, 4)
+    return Reading(qpos, *(np.zeros((*qpos.shape[:-1], size)) for size in sizes))
+
+
+def test_observation_index_by_index() -> None:
+    task, _ = _make()
+    model, data = task.model, mujoco.MjData(task.model)
+    rng = np.random.default_rng(1)
+    data.qpos[:] = model.key("stand").qpos + rng.uniform(-0.05, 0.05, model.nq)
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    data.qvel[:] = rng.normal(size=model.nv)
+    mujoco.mj_forward(model, data)
+    fresh = task.reset(rng.random((1, task.reset_uniforms)), np)
+    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 4)))
+    result = task.step(fresh.state, np.zeros((1, 10)), reading, rng.random((1, task.step_uniforms)), np)
+    observation, offset = result.observation[0], fresh.state.encoder_offset[0]
+
+    def joints(names: tuple[str, ...], values: str) -> list[float]:
+        return [getattr(data.joint(f"{side}-{name}"), values)[0] for side in ("left", "right") for name in names]
+
+    rotation = data.body("cassie-pelvis").xmat.reshape(3, 3)
+    acceleration = data.sensor("pelvis-acceleration").data - rotation.T @ [0, 0, 9.81]
+    angle = 2 * np.pi * result.state.phase[0]
+    assert observation.shape == (50,)
+    np.testing.assert_allclose(observation[0], data.qpos[2])
+    np.testing.assert_allclose(observation[1:5], data.body("cassie-pelvis").xquat)
+    np.testing.assert_allclose(observation[5:15], joints(MOTORS, "qpos") + offset[:10])
+    np.testing.assert_allclose(observation[15:18], data.qvel[0:3])
+    np.testing.assert_allclose(observation[18:21], data.qvel[3:6])
+    np.testing.assert_allclose(observation[21:31], joints(MOTORS, "qvel"))
+    np.testing.assert_allclose(observation[31:34], acceleration, atol=1e-9)
+    np.testing.assert_allclose(observation[34:40], joints(PASSIVE, "qpos") + offset[10:])
+    np.testing.assert_allclose(observation[40:46], joints(PASSIVE, "qvel"))
+    np.testing.assert_allclose(observation[46:48], [np.sin(angle), np.cos(angle)])
+    np.testing.assert_allclose(observation[48:50], fresh.state.command[0])
+    assert np.abs(offset).max() <= 0.01
+
+
+def test_acceleration_is_minus_gravity_in_free_fall() -> None:
+    task, _ = _make(**NOMINAL_ROBOT)
+    data = mujoco.MjData(task.model)
+    data.qpos[:] = task.model.key("stand").qpos
+    data.qpos[2] = 3.0
+    data.ctrl[:] = cassie.NEUTRAL_RAD
+    mujoco.mj_step(task.model, data, 40)  # the springs settle
+    fresh = task.reset(np.zeros((1, task.reset_uniforms)), np)
+    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 4)))
+    result = task.step(fresh.state, np.zeros((1, 10)), reading, np.zeros((1, task.step_uniforms)), np)
+    np.testing.assert_allclose(result.observation[0, 31:34], [0, 0, -9.81], atol=0.6)  # the legs still swing a little
+
+
+def test_reset_observation_is_the_initial_pose_at_rest() -> None:
+    task, _ = _make(**NOMINAL_ROBOT)
+    fresh = task.reset(np.random.default_rng(0).random((4, task.reset_uniforms)), np)
+    assert fresh.observation.shape == (4, 50)
+    np.testing.assert_allclose(fresh.observation[:, :5], np.tile([1.01, 1, 0, 0, 0], (4, 1)))
+    np.testing.assert_allclose(fresh.observation[:, 5:15], np.tile(cassie.NEUTRAL_RAD, (4, 1)), atol=1e-12)
+    assert (fresh.observation[:, 15:34] == 0).all()
+    assert fresh.model_fields == {}
+    assert len(set(fresh.state.phase)) == 4  # the gait starts anywhere in its cycle
+
+
+def _mirror_physics(task: Task, physics: np.ndarray) -> np.ndarray:
+    """The mirror image of (time, qpos, qvel), by joint name."""
+    model, mirrored = task.model, physics.copy()
+    qpos, qvel = physics[1 : 1 + model.nq], physics[1 + model.nq :]
+    new_qpos, new_qvel = mirrored[1 : 1 + model.nq], mirrored[1 + model.nq :]
+    new_qpos[:7] = qpos[:7] * [1, -1, 1, 1, -1, 1, -1]
+    new_qvel[:6] = qvel[:6] * [1, -1, 1, -1, 1, -1]
+    for joint in range(model.njnt):
+        side, _, kind = model.joint(joint).name.partition("-")
+        if side not in ("left", "right"):
+            continue
+        other = model.joint(f"{'right' if side == 'left' else 'left'}-{kind}")
+        to, speed_to = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        at, speed_at = other.qposadr[0], other.dofadr[0]
+        if kind == "achilles-rod":  # a ball joint in a frame whose z axis points sideways
+            new_qpos[to : to + 4] = qpos[at : at + 4] * [1, -1, -1, 1]
+            new_qvel[speed_to : speed_to + 3] = qvel[speed_at : speed_at + 3] * [-1, -1, 1]
+        else:
+            sign = -1 if kind in ("hip-roll", "hip-yaw") else 1
+            new_qpos[to], new_qvel[speed_to] = sign * qpos[at], sign * qvel[speed_at]
+    return mirrored
+
+
+def _mirror_task_state(task: Task, state: cassie.CassieState) -> cassie.CassieState:
+    motors, passive = state.encoder_offset[:, :10], state.encoder_offset[:, 10:]
+    encoder = np.concatenate([task.mirror.action(motors), passive[:, [3, 4, 5, 0, 1, 2]]], axis=1)
+    return state._replace(
+        phase=np.mod(state.phase + 0.5, 1.0),
+        command=state.command * [1, -1],
+        path_y=-state.path_y,
+        encoder_offset=encoder,
+        action=task.mirror.action(state.action),
+        torque=task.mirror.action(state.torque),
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_mirror_image_of_a_step_is_the_step_of_the_mirror_image(seed: int) -> None:
+    task, envs, state, action = _moving_state(16, seed, command={"resample_s": [0, 0]}, **NOMINAL_ROBOT)
+    offset = np.random.default_rng(seed).uniform(-0.01, 0.01, (1, 16))
+    state = state._replace(task=state.task._replace(encoder_offset=offset))
+    mirrored = state._replace(
+        physics=_mirror_physics(task, state.physics[0])[None], task=_mirror_task_state(task, state.task)
+    )
+    _, ours = envs.step(state, action, np.random.default_rng(0))
+    _, theirs = envs.step(mirrored, task.mirror.action(action), np.random.default_rng(0))
+    difference = np.abs(task.mirror.observation(theirs.final_observation) - ours.final_observation)[0]
+    # Not exact: the real pelvis has its centre of mass 0.3 mm off the middle plane. A wrong sign or index shows as
+    # a difference of the size of the values themselves.
+    assert np.delete(difference, [31, 32, 33]).max() < 0.02
+    assert difference[31:34].max() < 0.2  # accelerations in contact, m/s^2, of values around 10
+    np.testing.assert_allclose(theirs.reward_terms, ours.reward_terms, atol=0.01)
+    np.testing.assert_allclose(theirs.reward, ours.reward, atol=0.01)
+
+
+def test_mirroring_twice_changes_nothing() -> None:
+    mirror = cassie.mirror()
+    observation, action = np.arange(1.0, 51), np.arange(1.0, 11)
+    np.testing.assert_array_equal(mirror.observation(mirror.observation(observation)), observation)
+    np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
+    np.testing.assert_array_equal(mirror.action(cassie.NEUTRAL_RAD), cassie.NEUTRAL_RAD)
+
+
+def test_commands_are_drawn_again_when_due() -> None:
+    task, _ = _make(command={"resample_s": [2.0, 6.0], "stand_probability": 0.0})
+    fresh = task.reset(np.random.default_rng(0).random((2, task.reset_uniforms)), np)
+    step_s = fresh.state.env_step_s
+    state = fresh.state._replace(command_s=np.array([step_s[0] * 0.5, 3.0]))
+    uniforms = np.tile([1.0, 0.0, 0.9, 0.25], (2, 1))
+    result = task.step(state, np.zeros((2, 10)), _still_reading(task, fresh.qpos), uniforms, np)
+    np.testing.assert_allclose(result.state.command[0], [2.0, -0.1])
+    np.testing.assert_allclose(result.state.command_s[0], 3.0)
+    np.testing.assert_allclose(result.state.command[1], state.command[1])
+    np.testing.assert_allclose(result.state.command_s[1], 3.0 - step_s[1])
+    np.testing.assert_allclose(result.observation[:, 48:], result.state.command)  # the policy sees the new command
+
+
+def test_command_draws() -> None:
+    settings = Config().cassie
+    uniforms = np.random.default_rng(0).random((2000, 4))
+    command, seconds = cassie.draw_command(uniforms, settings, np)
+    standing = (command == 0).all(axis=1)
+    assert 0.07 < standing.mean() < 0.13
+    low, high = settings.command.forward_m_s
+    assert low <= command[:, 0].min() < low + 0.1
+    assert high - 0.1 < command[:, 0].max() < high
+    assert np.abs(command[:, 1]).max() <= 0.1
+    assert seconds.min() >= 2
+    assert seconds.max() < 6
+    once = from_dict({"cassie": {"command": {"resample_s": [0, 0]}}}).cassie
+    assert np.isinf(cassie.draw_command(uniforms, once, np)[1]).all()  # one command per episode
+
+
+def test_path_follows_the_commanded_lateral_speed() -> None:
+    task, _ = _make(**NOMINAL_ROBOT)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    state = fresh.state._replace(command=np.array([[0.5, 0.08]]), command_s=np.array([99.0]))
+    for _ in range(4):
+        state = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 4)), np).state
+    np.testing.assert_allclose(state.path_y, 4 * 0.025 * 0.08)
+
+
+@pytest.mark.parametrize(
+    ("height", "roll_deg", "pitch_deg", "expected"),
+    [
+        (0.9, 0, 0, False),
+        (0.59, 0, 0, True),
+        (3.01, 0, 0, True),
+        (0.9, 46, 0, True),
+        (0.9, 0, -46, True),
+        (0.9, 44, 0, False),
+    ],
+)
+def test_each_cause_of_termination(height: float, roll_deg: float, pitch_deg: float, expected: bool) -> None:
+    task, _ = _make(**NOMINAL_ROBOT)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    qpos = fresh.qpos.copy()
+    half = np.deg2rad([roll_deg, pitch_deg]) / 2
+    qpos[0, 2:7] = height, np.cos(half.sum()), np.sin(half[0]), np.sin(half[1]), 0
+    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 4)), np)
+    assert bool(result.terminated[0]) is expected
+
+
+def test_yaw_alone_never_terminates_and_is_reported() -> None:
+    task, _ = _make(**NOMINAL_ROBOT)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    qpos = fresh.qpos.copy()
+    qpos[0, 3:7] = np.cos(1.0), 0, 0, np.sin(1.0)
+    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 4)), np)
+    assert not result.terminated[0]
+    assert result.measures[0, task.measures.index("heading")] == pytest.approx(2.0)
+
+
+def test_the_clock_advances_by_one_environment_step() -> None:
+    task, _ = _make()
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    state = fresh.state._replace(phase=np.array([0.99]), command=np.array([[0.0, 0.0]]))
+    result = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 4)), np)
+    np.testing.assert_allclose(result.state.phase, 0.99 + 0.025 / 0.9 - 1)
+
+
+def test_numpy_equals_jax() -> None:
+    task, envs, state, action = _moving_state()
+    reading, _ = envs._simulate(state, task.control(state.task, action, np))
+    rng = np.random.default_rng(5)
+    reset_uniforms, uniforms = rng.random((1, task.reset_uniforms)), rng.random((1, task.step_uniforms))
+    ours = task.reset(reset_uniforms, np), task.step(state.task, action, reading, uniforms, np)
+    arguments = jax.tree.map(jnp.asarray, (state.task, action, reading, uniforms))
+    theirs = jax.jit(lambda u: task.reset(u, jnp))(reset_uniforms), jax.jit(lambda *a: task.step(*a, jnp))(*arguments)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)  # float64 against float32

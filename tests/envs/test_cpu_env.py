@@ -1,0 +1,159 @@
+"""The batched C MuJoCo environments: episodes, determinism, independence, divergence, restoring."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from hasrl_jax.config import Config, from_dict
+from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState, StepResult
+from hasrl_jax.envs.registry import make_task
+
+TASK = make_task(Config())
+LAYING = make_task(from_dict({"cassie": {"termination": {"min_height_m": 0.0, "max_tilt_deg": 180.0}}}))  # never ends
+
+
+@pytest.fixture(autouse=True)
+def _no_warning_file() -> None:
+    mujoco.set_mju_user_warning(lambda text: None)  # divergence is provoked on purpose here
+
+
+def _run(envs: CpuEnvs, steps: int, seed: int = 0, state: EnvState | None = None) -> tuple[EnvState, list[StepResult]]:
+    """`steps` environment steps with random actions that depend on the seed alone."""
+    rng = np.random.default_rng(seed)
+    state = envs.reset(rng) if state is None else state
+    results = []
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, (envs.num_envs, TASK.action_size))
+        state, result = envs.step(state, action, rng)
+        results.append(result)
+    return state, results
+
+
+def _leaves(state: EnvState) -> list[np.ndarray]:
+    simple = [getattr(state, name) for name in state._fields if name not in ("task", "model_fields")]
+    return [*simple, *state.task, *state.model_fields.values()]
+
+
+def test_a_fall_resets_and_keeps_the_final_observation() -> None:
+    envs = CpuEnvs(TASK, 4, 1000)
+    rng = np.random.default_rng(0)
+    state = envs.reset(rng)
+    fallen = np.zeros(4, bool)
+    for _ in range(120):
+        before = state
+        state, result = envs.step(state, rng.uniform(-1, 1, (4, 10)), rng)
+        ended = result.terminated
+        fallen |= ended
+        assert not result.truncated.any()
+        np.testing.assert_array_equal(state.is_first, ended)
+        np.testing.assert_array_equal(state.episode_step, np.where(ended, 0, before.episode_step + 1))
+        np.testing.assert_array_equal(state.observation[~ended], result.final_observation[~ended])
+        assert (result.final_observation[ended, 0] < 0.95).all()
+        np.testing.assert_array_equal(state.observation[ended, 0], 1.01)  # the initial pose
+        np.testing.assert_array_equal(state.episode_return[ended], 0)
+        changed = (state.model_fields["body_mass"] != before.model_fields["body_mass"]).any(axis=1)
+        np.testing.assert_array_equal(changed, ended)  # another robot for another episode
+    assert fallen.all()
+
+
+def test_truncated_at_the_cap() -> None:
+    envs = CpuEnvs(LAYING, 3, 7)
+    state, results = _run(envs, 14)
+    truncated = np.array([result.truncated.all() for result in results])
+    np.testing.assert_array_equal(np.flatnonzero(truncated), [6, 13])
+    assert not any(result.truncated.any() for index, result in enumerate(results) if index not in (6, 13))
+    assert state.is_first.all()
+    assert (state.episode_step == 0).all()
+
+
+def test_same_seed_same_numbers() -> None:
+    first, results = _run(CpuEnvs(TASK, 3, 30), 40)
+    again, results_again = _run(CpuEnvs(TASK, 3, 30), 40)
+    other, _ = _run(CpuEnvs(TASK, 3, 30), 40, seed=1)
+    for a, b in zip(_leaves(first), _leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(results, results_again, strict=True):
+        np.testing.assert_array_equal(np.concatenate(a[4:], axis=1), np.concatenate(b[4:], axis=1))
+    assert (first.physics != other.physics).any()
+
+
+def test_environments_do_not_touch_each_other() -> None:
+    envs = CpuEnvs(LAYING, 3, 1000)
+    rng = np.random.default_rng(0)
+    state = envs.reset(rng)
+    actions = rng.uniform(-1, 1, (10, 3, 10))
+    changed_actions = actions.copy()
+    changed_actions[:, 1] *= -0.5
+
+    def play(sequence: np.ndarray) -> EnvState:
+        envs.restore(state)
+        current = state
+        for action in sequence:
+            current, _ = envs.step(current, action, np.random.default_rng(0))
+        return current
+
+    ours, theirs = play(actions), play(changed_actions)
+    np.testing.assert_array_equal(ours.physics[[0, 2]], theirs.physics[[0, 2]])
+    np.testing.assert_array_equal(ours.episode_return[[0, 2]], theirs.episode_return[[0, 2]])
+    assert (ours.physics[1] != theirs.physics[1]).any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e12])
+def test_a_diverged_simulation_is_flagged_alone(bad: float) -> None:
+    envs = CpuEnvs(LAYING, 3, 1000)
+    state, _ = _run(envs, 3)
+    action = np.zeros((3, 10))
+    expected, healthy = envs.step(state, action, np.random.default_rng(0))
+    assert not healthy.diverged.any()
+    envs.restore(state)
+    physics = state.physics.copy()
+    physics[1, 1 + TASK.model.nq] = bad  # a velocity
+    after, result = envs.step(state._replace(physics=physics), action, np.random.default_rng(0))
+    np.testing.assert_array_equal(result.diverged, [False, True, False])
+    assert not (result.terminated | result.truncated).any()
+    np.testing.assert_array_equal(after.is_first, [False, True, False])
+    assert after.observation[1, 0] == 1.01
+    assert after.episode_step[1] == 0
+    for values in _leaves(after):
+        assert not np.isnan(values).any()  # nothing of the bad step survives
+    np.testing.assert_array_equal(after.physics[[0, 2]], expected.physics[[0, 2]])
+    np.testing.assert_array_equal(result.final_observation[[0, 2]], healthy.final_observation[[0, 2]])
+    _, following = envs.step(after, action, np.random.default_rng(0))
+    assert not following.diverged.any()
+
+
+def test_a_bad_action_is_an_error() -> None:
+    envs = CpuEnvs(TASK, 2, 100)
+    state = envs.reset(np.random.default_rng(0))
+    with pytest.raises(FloatingPointError, match="action"):
+        envs.step(state, np.full((2, 10), np.nan), np.random.default_rng(0))
+
+
+def test_restored_environments_go_on_identically() -> None:
+    envs = CpuEnvs(TASK, 3, 25)
+    middle, _ = _run(envs, 20)
+    copied = EnvState(*(value.copy() if isinstance(value, np.ndarray) else value for value in middle))
+    ours, _ = _run(envs, 20, seed=9, state=middle)  # crosses the cap, so every model is drawn anew
+    fresh = CpuEnvs(TASK, 3, 25)
+    fresh.restore(copied)
+    theirs, _ = _run(fresh, 20, seed=9, state=copied)
+    for a, b in zip(_leaves(ours), _leaves(theirs), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_batch_equals_plain_mujoco() -> None:
+    envs = CpuEnvs(TASK, 2, 100)
+    rng = np.random.default_rng(3)
+    state = envs.reset(rng)
+    action = rng.uniform(-0.5, 0.5, (2, 10))
+    after, _ = envs.step(state, action, rng)
+    for env in range(2):
+        model = make_task(Config()).model
+        model.opt.timestep = state.model_fields["timestep"][env]
+        for name in set(state.model_fields) - {"timestep"}:
+            getattr(model, name)[:] = state.model_fields[name][env]
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = np.split(state.physics[env, 1:], [model.nq])
+        data.ctrl[:] = TASK.control(state.task, action, np)[env]
+        mujoco.mj_step(model, data, TASK.steps_per_env_step)
+        np.testing.assert_array_equal(after.physics[env], [data.time, *data.qpos, *data.qvel])

@@ -1,0 +1,123 @@
+"""The gymnasium interface."""
+
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import hasrl_jax  # noqa: F401 (importing it registers the environments)
+from hasrl_jax.config import ConfigError, from_dict
+from hasrl_jax.envs.cpu_env import CpuEnvs
+from hasrl_jax.envs.gymnasium_env import TaskEnv, make
+from hasrl_jax.envs.registration import ENVIRONMENTS
+
+INFINITE_BOUNDS = "A Box observation space m.* value is"  # positions and velocities have no honest bounds
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_check_env(name: str) -> None:
+    env = gymnasium.make(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=f".*{INFINITE_BOUNDS}")
+        check_env(env.unwrapped, skip_render_check=True)  # rendering needs OpenGL and has a test of its own
+    assert env.observation_space.dtype == np.float32
+    assert env.metadata["render_fps"] == 40
+
+
+@pytest.mark.parametrize(
+    ("imports", "prefix"),
+    [("hasrl_jax, gymnasium", ""), ("gymnasium, hasrl_jax.envs", ""), ("gymnasium", "hasrl_jax:")],
+)
+def test_registered_in_any_order_and_without_jax(imports: str, prefix: str) -> None:
+    code = f"import sys, {imports}; gymnasium.make('{prefix}hasrl_jax/Cassie-v0'); assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
+
+
+def test_equals_the_collectors_environments() -> None:
+    env = make("cassie")
+    observation, _ = env.reset(seed=3)
+    envs = CpuEnvs(env.task, 1, env.config.collect.max_episode_steps)
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(3)))
+    state = envs.reset(rng)
+    actions = np.random.default_rng(0).uniform(-1, 1, (200, 10)).astype(np.float32)
+    for action in actions:
+        np.testing.assert_array_equal(observation, state.observation[0].astype(np.float32))
+        observation, reward, terminated, truncated, info = env.step(action)
+        state, result = envs.step(state, action[None].astype(np.float64), rng)
+        assert reward == result.reward[0]
+        assert reward == pytest.approx(sum(value for name, value in info.items() if name.startswith("reward/")))
+        assert {*env.task.measures, "diverged"} <= set(info)
+        if terminated or truncated:
+            break
+    assert terminated
+    np.testing.assert_array_equal(observation, result.final_observation[0].astype(np.float32))
+    assert observation[0] < 0.95  # where the fall led, not the next episode
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(actions[0])
+
+
+def test_fixed_command() -> None:
+    env = make("cassie")
+    for command in ((0.8, -0.05), (-0.2, 0.1)):
+        observation, _ = env.reset(seed=0, options={"command": command})
+        np.testing.assert_allclose(observation[48:], command, rtol=1e-6)
+        observation, *_, info = env.step(np.zeros(10, np.float32))
+        np.testing.assert_allclose(observation[48:], command, rtol=1e-6)
+        assert info["forward_command"] == pytest.approx(command[0])
+    drawn = [tuple(env.reset(seed=seed)[0][48:]) for seed in range(4)]
+    assert len(set(drawn)) > 1  # the option held for its own episode only
+
+
+def test_the_time_limit_truncates() -> None:
+    env = make("cartpole", from_dict({"collect": {"max_episode_steps": 3}}))
+    env.reset(seed=0)
+    flags = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(3)]
+    assert flags == [(False, False), (False, False), (False, True)]
+
+
+def test_a_diverged_simulation_truncates_with_the_last_valid_observation() -> None:
+    mujoco.set_mju_user_warning(lambda text: None)
+    env = make("cassie")
+    before, _ = env.reset(seed=0)
+    env._state.physics[0, -1] = np.nan
+    observation, reward, terminated, truncated, info = env.step(np.zeros(10, np.float32))
+    assert (reward, terminated, truncated, info["diverged"]) == (0.0, False, True, True)
+    np.testing.assert_array_equal(observation, before)
+
+
+def test_a_push_adds_its_momentum() -> None:
+    env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": False}}}))
+    env.reset(seed=0)
+    env.push(0.0, 10.0)
+    model, data = env.task.model, mujoco.MjData(env.task.model)
+    data.qpos[:], data.qvel[:] = np.split(env._state.physics[0, 1:], [model.nq])
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    np.testing.assert_allclose(data.subtree_linvel[0] * model.body_mass.sum(), [0, 10, 0], atol=1e-9)
+
+
+def test_bad_arguments() -> None:
+    with pytest.raises(ConfigError, match="task"):
+        make("hopper")
+    with pytest.raises(ConfigError, match="track"):
+        TaskEnv(camera="nowhere")
+    with pytest.raises(ConfigError, match="render_mode"):
+        TaskEnv(render_mode="human")
+    env = make("cassie")
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(np.zeros(10))
+    with pytest.raises(ValueError, match="speed"):
+        env.reset(options={"speed": 1})
+    with pytest.raises(ValueError, match="command"):
+        env.reset(options={"command": (1.0, float("nan"))})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros(9))
+    with pytest.raises(FloatingPointError):
+        env.step(np.full(10, np.nan))
