@@ -4,6 +4,7 @@ States come from C simulations under random actions. Both engines then take the 
 up to the step where either engine ends its episode, because what follows belongs to another episode.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -98,11 +99,13 @@ def random_states(task: Task, num_states: int, rng: np.random.Generator) -> EnvS
     stop = rng.integers(0, WARM_UP + 1, num_states)
     for step in range(1, WARM_UP + 1):
         state, _ = envs.step(state, ACTION_SCALE * rng.standard_normal((num_states, task.action_size)), rng)
-        pick = stop == step
-        chosen = jax.tree.map(
-            lambda new, old: np.where(pick.reshape(-1, *[1] * (old.ndim - 1)), new, old), state, chosen
-        )
+        chosen = jax.tree.map(partial(_take, stop == step), state, chosen)
     return chosen
+
+
+def _take(pick: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """`new` in the rows where `pick`, else `old`."""
+    return np.where(pick.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
 
 def run_c(task: Task, start: EnvState, actions: np.ndarray, uniforms: np.ndarray) -> Recording:
@@ -204,11 +207,11 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
 def to_markdown(report: dict[str, Any]) -> str:
     """The report of `measure` as a table: one row per quantity, largest and mean difference per horizon."""
     settings, horizons = report["settings"], report["horizons"]
+    caption = (
+        "{task}, {states} states, MJX {impl} in {precision}, {steps_per_env_step} physics steps of {timestep_s:g} s"
+    )
     lines = [
-        "{task}, {states} states, MJX {impl} in {precision}, {steps_per_env_step} physics steps of {timestep_s:g} s".format(
-            **settings
-        )
-        + " per environment step; largest (mean) absolute difference",
+        caption.format(**settings) + " per environment step; largest (mean) absolute difference",
         "",
         "| quantity | " + " | ".join(f"{n} environment step{'s' if n != '1' else ''}" for n in horizons) + " |",
         "|---" * (1 + len(horizons)) + "|",

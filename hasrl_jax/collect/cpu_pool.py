@@ -70,14 +70,14 @@ class CpuPool:
         self.config, self.plan = config, plan
         self.workers_lost = 0
         self._failures = [0] * plan.num_workers
-        self._workers: list[_Worker | None] = [None] * plan.num_workers
+        self._workers: list[_Worker] = []
         self._block = shared_memory.open_block(config, plan, task.observation_size, task.action_size)
         self._iteration, self._version = -1, -1
         self.busy = False  # between `start` and `finish`
         self._started = 0.0
         try:
             for index in range(plan.num_workers):
-                self._workers[index] = self._spawn(index)
+                self._workers.append(self._spawn(index))
             for index in range(plan.num_workers):
                 self._await_ready(index)
         except BaseException:
@@ -93,7 +93,7 @@ class CpuPool:
     @property
     def process_ids(self) -> list[int]:
         """Operating-system process of each worker, in worker order."""
-        return [worker.process.pid for worker in self._workers if worker is not None]
+        return [worker.process.pid for worker in self._workers]
 
     def start(self, parameters: dict[str, np.ndarray], iteration: int, version: int) -> None:
         """Asks every worker for one iteration of steps; returns at once.
@@ -174,11 +174,11 @@ class CpuPool:
 
     def close(self) -> None:
         """Ends all workers and frees the shared memory."""
-        for worker in filter(None, self._workers):
+        for worker in self._workers:
             worker.connection.close()
             worker.process.kill()  # it holds nothing that needs tidying
             worker.process.wait()
-        self._workers = [None] * self.plan.num_workers
+        self._workers = []
         self._block.close()
 
     def _spawn(self, index: int) -> _Worker:
@@ -193,7 +193,8 @@ class CpuPool:
         )
         theirs.close()
         setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}
-        ours.send_bytes(json.dumps(setup).encode())
+        with contextlib.suppress(OSError):  # it died at once; waiting for it to be ready says how
+            ours.send_bytes(json.dumps(setup).encode())
         return _Worker(process, ours)
 
     def _await_ready(self, index: int) -> None:

@@ -121,7 +121,8 @@ class MjxCollector:
     Args:
       plan: from `make_mjx_plan`.
       engine: the task on MJX; its environments per device must be `plan.num_envs / mesh.size`.
-      policy: a network with `__call__(observation, carry, is_first, mean, std) -> (mean action, carry)` and `log_std()`.
+      policy: a network with `__call__(observation, carry, is_first, mean, std) -> (mean action, carry)` and
+        `log_std() -> [A]`.
       value: a network with `__call__(observation, mean, std) -> value`.
       mesh: environments are split over its axis `data`, like the learner's trajectories.
     """
@@ -183,8 +184,8 @@ class MjxCollector:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
             raise MemoryError(
-                f"mjx.num_envs: {self.plan.num_envs} environments of {self.plan.steps_per_env} steps do not fit into the "
-                f"devices' memory; try {self.plan.num_envs // 2}"
+                f"mjx.num_envs: {self.plan.num_envs} environments of {self.plan.steps_per_env} steps do not fit into "
+                f"the devices' memory; try {self.plan.num_envs // 2}"
             ) from error
 
     def _collect(
