@@ -39,7 +39,7 @@ class CheckpointError(RuntimeError):
     """A checkpoint or policy file cannot be written or read; the message is one line and names the path."""
 
 
-class _Damaged(Exception):
+class _DamagedError(Exception):
     """What was read is not what was written."""
 
 
@@ -167,7 +167,7 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             arrays = dict(archive)
         text, digest = arrays.pop(_POLICY_METADATA), arrays.pop(_POLICY_DIGEST)
         if str(digest) != _digest(arrays, {_POLICY_METADATA: text}):
-            raise _Damaged("its contents do not match their SHA-256 digest")
+            raise _DamagedError("its contents do not match their SHA-256 digest")
         return arrays, json.loads(str(text))
     except FileNotFoundError:
         raise CheckpointError(f"{path}: there is no policy file") from None
@@ -178,7 +178,7 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def _restore(path: Path, step: int, template: LearnerState) -> Loaded:
     """The step in `path`, verified."""
     if (path / _FILES_DIGEST).read_text() != _digest_of_files(path):
-        raise _Damaged("its files do not match their SHA-256 digest")
+        raise _DamagedError("its files do not match their SHA-256 digest")
     wanted = _named_leaves(template)
     with _quiet(), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
         record = checkpointer.restore(path.absolute(), args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
@@ -189,7 +189,7 @@ def _restore(path: Path, step: int, template: LearnerState) -> Loaded:
         restored = checkpointer.restore(path.absolute(), args=ocp.args.Composite(**items))
     arrays, blobs = restored["learner"], restored["blobs"] if any(sizes) else {}
     if record["step"] != step or record["sha256"] != _digest(arrays, blobs):
-        raise _Damaged("its arrays do not match their SHA-256 digest")
+        raise _DamagedError("its arrays do not match their SHA-256 digest")
     leaves = [_place(arrays[name], leaf) for name, leaf in wanted.items()]
     learner = jax.tree.unflatten(jax.tree.structure(template), leaves)
     blob_list = [blobs[f"{i:05d}"].tobytes() if size else b"" for i, size in enumerate(sizes)]
@@ -285,7 +285,7 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     text = " ".join(str(error).split())
-    return text if isinstance(error, _Damaged) else f"{type(error).__name__}: {text[:200]}"
+    return text if isinstance(error, _DamagedError) else f"{type(error).__name__}: {text[:200]}"
 
 
 @contextlib.contextmanager

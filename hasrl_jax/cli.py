@@ -19,8 +19,8 @@ SHORTHAND = {"--num-workers": "--collect.num-workers"}
 def parse_train(arguments: list[str]) -> tuple[Config, bool]:
     """The configuration of a run, and whether it continues one.
 
-    `--config FILE` reads a YAML file (default: configs/cassie_walk.yaml), `--resume DIR` the configuration of that run; everything
-    else overrides single fields, `--ppo.clip 0.1`.
+    `--config FILE` reads a YAML file (default: configs/cassie_walk.yaml), `--resume DIR` the configuration of that
+    run; everything else overrides single fields, `--ppo.clip 0.1`.
 
     Raises:
       ConfigError: an impossible value; RunError: `--resume` names no run.

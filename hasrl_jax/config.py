@@ -4,6 +4,7 @@ A YAML file names only what it changes from the defaults of these classes. Train
 `configs/cassie_walk.yaml`. Every field is read somewhere, and its comment gives its meaning and unit.
 """
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -224,11 +225,9 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
             return tuple(_convert(v, a, f"{path}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
         raise ConfigError(f"{path}: got {value!r}; expected a list of {len(args)} numbers")
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
-        try:
+        with contextlib.suppress(ValueError):
             value = float(value)
-        except ValueError:
-            pass
-    accepted = {float: (int, float), int: int, bool: bool, str: str}[hint]
+    accepted: Any = {float: (int, float), int: int, bool: bool, str: str}[hint]
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{path}: got {value!r}; expected {hint.__name__}")
     if hint is float and not math.isfinite(value):

@@ -29,8 +29,8 @@ def check(config: Config) -> None:
         "evaluate.episodes": config.evaluate.episodes,
         "checkpoint.keep": config.checkpoint.keep,
     }
-    for name, value in at_least_one.items():
-        _require(value >= 1, name, value, "at least 1")
+    for name, count in at_least_one.items():
+        _require(count >= 1, name, count, "at least 1")
     positive = {
         "collect.worker_start_timeout_s": collect.worker_start_timeout_s,
         "collect.worker_timeout_s": collect.worker_timeout_s,

@@ -28,6 +28,12 @@ evaluate: {every_iterations: 2, episodes: 2}
 checkpoint: {every_iterations: 2}
 total_env_steps: 512
 """
+METRICS = {
+    *("iteration", "env_steps", "episode_return_train", "episode_return_test", "episode_length_train"),
+    *("episode_length_test", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction"),
+    *("explained_variance", "policy_lag", "env_steps_per_second", "collect_seconds", "update_seconds", "test_seconds"),
+    *("reward/foot_force", "reward/action_change", "diverged_envs", "workers_lost"),
+}
 
 
 @pytest.fixture
@@ -87,8 +93,7 @@ def test_the_command_trains_cassie_for_two_iterations(tmp_path):
     assert "iteration 2" in finished.stdout
     first, second = records(run)
     assert (first["iteration"], second["iteration"], second["env_steps"]) == (1, 2, 2048)
-    for name in ["episode_return_train", "episode_length_train", "episode_return_test", "episode_length_test", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction", "explained_variance", "policy_lag", "env_steps_per_second", "collect_seconds", "update_seconds", "test_seconds", "reward/foot_force", "reward/action_change", "diverged_envs", "workers_lost"]:
-        assert name in second, name
+    assert second.keys() >= METRICS
     assert second["ratio_first"] == pytest.approx(1.0, abs=1e-4)
     assert list((run / "tensorboard").glob("events*"))
     assert load_yaml(run / "config.yaml").collect.num_workers == 1

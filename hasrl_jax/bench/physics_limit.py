@@ -83,7 +83,8 @@ def record(config: Config, env_steps: int, seed: int) -> list[Stretch]:
     rng = np.random.default_rng([config.seed, seed])
     state = envs.reset(rng)
     std = np.exp(config.network.initial_log_std)
-    starts, controls, stretches = list(state.physics.copy()), [[] for _ in range(num_envs)], []
+    starts, stretches = list(state.physics.copy()), []
+    controls: list[list[np.ndarray]] = [[] for _ in range(num_envs)]
     fields = [_fields_of(state.model_fields, env) for env in range(num_envs)]
     horizon = -(-env_steps // num_envs)
     for t in range(horizon):
@@ -92,7 +93,7 @@ def record(config: Config, env_steps: int, seed: int) -> list[Stretch]:
         for env in range(num_envs):
             controls[env].append(control[env])
         state, _ = envs.step(state, action, rng)
-        for env in np.flatnonzero(state.is_first | (t == horizon - 1)):
+        for env in np.flatnonzero(state.is_first | (t == horizon - 1)).tolist():
             model = _with_fields(task.model, fields[env])
             stretches.append(Stretch(model, mujoco.MjData(model), starts[env], np.array(controls[env])))
             starts[env], controls[env] = state.physics[env].copy(), []

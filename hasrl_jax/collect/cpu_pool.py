@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from multiprocessing.connection import Connection, Pipe, wait
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -126,7 +126,7 @@ class CpuPool:
         while pending:
             by_connection = {self._workers[index].connection: index for index in pending}
             for ready in wait(list(by_connection), timeout=1.0):
-                index = by_connection[ready]
+                index = by_connection[cast(Connection, ready)]
                 pending.discard(index)
                 reply, failure = self._receive(index)
                 if failure is None:

@@ -101,7 +101,7 @@ class Block:
     """The whole shared block: heartbeats, parameter buffers, and two trajectory slots per worker."""
 
     def __init__(self, descriptor: int, num_workers: int, parameters: Specs, slot: Specs):
-        beat = {"heartbeat": ((num_workers,), "float64")}
+        beat: Specs = {"heartbeat": ((num_workers,), "float64")}
         self.size = size_of(beat) + NUM_BUFFERS * (size_of(parameters) + num_workers * size_of(slot))
         self.descriptor = create(self.size) if descriptor < 0 else descriptor
         self._memory = mmap.mmap(self.descriptor, self.size)

@@ -13,6 +13,7 @@ import numpy as np
 from mujoco import rollout
 
 from hasrl_jax.envs.task import Reading, Task
+from hasrl_jax.types import Array
 
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
@@ -33,13 +34,13 @@ class EnvState(NamedTuple):
 class StepResult(NamedTuple):
     """What one environment step of E environments produced."""
 
-    reward: np.ndarray  # [E]
-    terminated: np.ndarray  # [E] bool
-    truncated: np.ndarray  # [E] bool: the time limit
-    diverged: np.ndarray  # [E] bool: the simulation failed; nothing of this step is valid
-    final_observation: np.ndarray  # [E, O] the true next observation, also where a new episode begins
-    reward_terms: np.ndarray  # [E, R]
-    measures: np.ndarray  # [E, M]
+    reward: Array  # [E]
+    terminated: Array  # [E] bool
+    truncated: Array  # [E] bool: the time limit
+    diverged: Array  # [E] bool: the simulation failed; nothing of this step is valid
+    final_observation: Array  # [E, O] the true next observation, also where a new episode begins
+    reward_terms: Array  # [E, R]
+    measures: Array  # [E, M]
 
 
 class CpuEnvs:

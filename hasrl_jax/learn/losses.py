@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from hasrl_jax.config import PPOConfig
-from hasrl_jax.learn import distributions, returns
-from hasrl_jax.learn.networks import Policy, Value
+from hasrl_jax.learn import distributions, networks, returns
+from hasrl_jax.learn.networks import Parameters, Policy, Value
 from hasrl_jax.types import Trajectory
 
-Parameters = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]
 
 _MAX_LOG_RATIO = 20.0  # exp stays finite in float32
@@ -51,7 +50,7 @@ def policy_loss(
     """
     steps = batch.trajectory
     action_mean, _ = policy.apply({"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std)
-    log_std = policy.apply({"params": params}, method=Policy.log_std)
+    log_std = networks.log_std(policy, params)
     log_ratio = distributions.log_prob(steps.action, action_mean, log_std) - steps.log_prob
     log_ratio = jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
     ratio = jnp.exp(log_ratio)
@@ -72,5 +71,5 @@ def value_loss(
     params: Parameters, value: Value, batch: Batch, mean: jax.Array, std: jax.Array, ppo: PPOConfig
 ) -> jax.Array:
     """c2 E_t[(V(s_t) - R_t)^2] / 2; arguments as in `policy_loss`. Source: paper II.E (critic loss)."""
-    prediction = value.apply({"params": params}, batch.trajectory.observation, mean, std)
+    prediction = networks.values(value, params, batch.trajectory.observation, mean, std)
     return ppo.value_coefficient * 0.5 * returns.masked_mean(jnp.square(prediction - batch.target), batch.weight)

@@ -4,6 +4,8 @@ The parameters are flat dictionaries with explicit names, so that a collector ca
 arrays alone, without this module.
 """
 
+from typing import cast
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from hasrl_jax.config import NetworkConfig
 from hasrl_jax.learn.lstm import GATES, lstm_layer
 from hasrl_jax.types import Mirror
 
+Parameters = dict[str, jax.Array]
 LSTM_LAYERS = 2
 OBSERVATION_CLIP = 10.0  # bound of a normalised observation, in standard deviations
 
@@ -204,6 +207,16 @@ class Value(nn.Module):
         features = jnp.tanh(features @ kernel_1 + bias_1)
         value = (features @ kernel_2 + bias_2)[..., 0]
         return value if self.mirror is None else 0.5 * (value[0] + value[1])
+
+
+def log_std(policy: Policy, params: Parameters) -> jax.Array:
+    """The log standard deviation that `policy` acts with, [A]."""
+    return cast(jax.Array, policy.apply({"params": params}, method=Policy.log_std))
+
+
+def values(value: Value, params: Parameters, observation: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
+    """V(s) of raw observations [..., O] under the normaliser's mean and deviation [O]: [...]."""
+    return cast(jax.Array, value.apply({"params": params}, observation, mean, std))
 
 
 def make_networks(

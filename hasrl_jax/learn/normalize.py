@@ -16,7 +16,7 @@ MINIMUM_STD = 1e-2  # an almost constant observation must not become large noise
 class Normalizer(NamedTuple):
     """Sufficient statistics of all observations seen; part of a checkpoint."""
 
-    count: jax.Array  # [] float32, observations counted
+    count: jax.Array  # type: ignore[assignment]  # [] float32, observations counted
     mean: jax.Array  # [O] float32
     m2: jax.Array  # [O] float32, sum of squared distances from the mean
 

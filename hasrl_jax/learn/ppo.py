@@ -13,7 +13,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hasrl_jax.config import Config, PPOConfig
-from hasrl_jax.learn import normalize, returns
+from hasrl_jax.learn import networks, normalize, returns
 from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS, minibatch_indices
 from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, value_loss
 from hasrl_jax.learn.networks import Policy, Value, make_networks
@@ -179,7 +179,7 @@ class Update:
         policy = (state.policy_params, state.policy_opt_state)
         value = (state.value_params, state.value_opt_state)
         (policy, value, _), history = jax.lax.scan(minibatch_step, (policy, value, jnp.asarray(True)), indices)
-        log_std = self.policy.apply({"params": policy[0]}, method=Policy.log_std)
+        log_std = networks.log_std(self.policy, policy[0])
         metrics |= _summarize(*history)
         metrics |= {"learning_rate": scale * ppo.policy_learning_rate, "std_mean": jnp.mean(jnp.exp(log_std))}
         steps = batch.trajectory
