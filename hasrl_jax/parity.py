@@ -21,6 +21,7 @@ from hasrl_jax.envs.task import Task
 HORIZONS = (1, 10, 40)  # environment steps
 WARM_UP = 20  # environment steps under random actions, at most, before the comparison
 ACTION_SCALE = 0.3  # standard deviation of the random actions
+SMALLEST_SPREAD = 1e-2  # deviation of an observation, at least, as in the learner's normaliser
 NEVER = 2**31 - 1  # no time limit
 
 
@@ -58,7 +59,7 @@ def measure(
     Args:
       config: reads the task and `physics`.
       num_states: N, random states, each with random actions of its own.
-      horizons: environment steps after which to report.
+      horizons: numbers of environment steps after which to report.
       seed: of states, actions and draws.
       impl: "jax" or "warp".
       double_precision: runs MJX in float64, which tells a different model from rounding.
@@ -66,7 +67,8 @@ def measure(
     Returns:
       {"settings": {...}, "horizons": {steps: {quantity: {"max", "mean"}, ...}}}, ready for JSON. For every horizon:
       `observation` and every reward term (absolute differences after exactly that many environment steps, over the
-      environments still running), `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m`, `compared` (share of
+      environments still running), `observation_relative` (to the deviation of each element over those environments),
+      `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m`, `compared` (share of
       environments still running) and `termination_agreement` (share of all environments that either both run on or
       both ended within the horizon, at the same step).
     """
@@ -77,7 +79,7 @@ def measure(
     actions = ACTION_SCALE * rng.standard_normal((steps, num_states, task.action_size))
     uniforms = rng.random((steps, num_states, task.step_uniforms))
     with jax.enable_x64(double_precision):
-        ours = run_mjx(make_engine(task, impl, NEVER, num_states), start, actions, uniforms)
+        ours = run_mjx(make_engine(task, impl, NEVER, num_states, warp_on_cpu=True), start, actions, uniforms)
     reference = run_c(task, start, actions, uniforms)
     settings = {
         "task": task.name,
@@ -191,9 +193,12 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
         return {"max": float(values.max()), "mean": float(values.mean())} if values.size else {"max": 0.0, "mean": 0.0}
 
     last = steps - 1
+    difference = np.abs(reference.observation[last] - ours.observation[last])[running]
+    spread = np.maximum(reference.observation[last][running].std(axis=0), SMALLEST_SPREAD) if running.any() else 1.0
     terms = np.abs(reference.reward_terms[last] - ours.reward_terms[last])[running]
     result: dict[str, Any] = {
-        "observation": summary(np.abs(reference.observation[last] - ours.observation[last])[running]),
+        "observation": summary(difference),
+        "observation_relative": summary(difference / spread),
         **{name: summary(terms[:, i]) for i, name in enumerate(task.reward_terms)},
         "loop_error_difference_m": summary(np.abs(reference.loop_error[last] - ours.loop_error[last])[alive]),
         "loop_error_c_m": summary(reference.loop_error[last][alive]),

@@ -212,7 +212,7 @@ class MjxCollector:
         variables = {"params": parameters.policy}
         normalizer = (parameters.observation_mean, parameters.observation_std)
         mean, carry = self.policy.apply(variables, envs.observation, state.carry, envs.is_first, *normalizer)
-        log_std = self.policy.apply(variables, method="log_std")
+        log_std: Array = self.policy.apply(variables, method="log_std")
         keys = jax.vmap(jax.random.split)(state.key)
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:]))(keys[:, 1])
         action = mean + jnp.exp(log_std) * noise
@@ -246,7 +246,7 @@ class MjxCollector:
         next_is_lost = jnp.pad(steps.diverged[:, 1:] & ~steps.is_first[:, 1:], ((0, 0), (0, 1)))
         is_last = jnp.arange(1, self.plan.steps_per_env + 1) % self.plan.max_length == 0
         truncated = steps.truncated | ((next_is_lost | is_last) & mask & ~steps.terminated)
-        following = value(steps.final_observation, *normalizer)
+        following: Array = value(steps.final_observation, *normalizer)
 
         def fold(field: Array) -> Array:
             return field.reshape(-1, self.plan.max_length, *field.shape[2:])

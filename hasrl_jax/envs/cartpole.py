@@ -14,6 +14,7 @@ from hasrl_jax.envs.randomize import between
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
 
+ASSET = "cartpole.xml"
 MAX_ANGLE_RAD = 0.2
 MAX_POSITION_M = 1.0
 START = 0.05  # half width of the uniform start position (m), angle (rad) and of their rates
@@ -29,7 +30,8 @@ def make(config: Config) -> Task:
     """The task with its model compiled."""
     return Task(
         name="cartpole",
-        model=load_model("cartpole.xml", config.physics),
+        asset=ASSET,
+        model=load_model(ASSET, config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=2,
         action_size=1,

@@ -14,6 +14,7 @@ from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, 
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
 
+ASSET = "cassie.xml"
 OBSERVATION_SIZE = 50
 ACTION_SIZE = 10
 NUM_ENCODERS = 16  # ten motors, six passive joints
@@ -51,7 +52,7 @@ class Constants(NamedTuple):
 
 def make(config: Config) -> Task:
     """The task with its model compiled and its names resolved."""
-    model = load_model("cassie.xml", config.physics)
+    model = load_model(ASSET, config.physics)
     nominal = randomize.nominal(model)
     constants = Constants(
         config=config.cassie,
@@ -63,6 +64,7 @@ def make(config: Config) -> Task:
     )
     return Task(
         name="cassie",
+        asset=ASSET,
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=OBSERVATION_SIZE,

@@ -15,6 +15,7 @@ from hasrl_jax import config as config_module
 from hasrl_jax import config_checks
 from hasrl_jax.config import Config, ConfigError
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
 from hasrl_jax.envs.registry import TASKS, make_task
 from hasrl_jax.envs.task import Task
@@ -208,8 +209,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return config
 
     def _make_renderer(self) -> mujoco.Renderer:
-        # A model of its own: the one that is simulated carries the randomised fields.
-        model = make_task(self.config).model
+        # A model of its own: the one that is simulated has no visual shapes and carries the randomised fields.
+        model = load_model(self.task.asset, self.config.physics, visual=True)
         height, width = self.frame_size
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         if self._shadow_px is not None:

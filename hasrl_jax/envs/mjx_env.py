@@ -4,8 +4,7 @@ The counterpart of `cpu_env` for accelerators. Shapes are those of a single envi
 every step prepares a fresh episode and takes it where the last one ended: each episode has draws of its own.
 """
 
-import contextlib
-import io
+import importlib.util
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,13 +14,9 @@ import mujoco
 
 from hasrl_jax.config import ConfigError
 from hasrl_jax.envs.cpu_env import StepResult
+from hasrl_jax.envs.mjx_physics import Loops, find_loops, mjx, physics_step
 from hasrl_jax.envs.task import Reading, Task
 from hasrl_jax.types import Array
-
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional Warp is missing
-    from mujoco import mjx
-
-    from hasrl_jax.envs.mjx_physics import Loops, find_loops, physics_step
 
 LARGEST = mujoco.mjMAXVAL  # C MuJoCo, too, gives up a simulation that holds a larger number
 # Bits of the overflow word of MuJoCo Warp: broad phase, narrow phase and collision detection; constraint rows and
@@ -162,16 +157,18 @@ def make_engine(
     num_envs: int = 1,
     contacts_per_env: int = 16,
     constraints_per_env: int = 64,
+    warp_on_cpu: bool = False,
 ) -> MjxEngine:
     """Puts the task's model on the default device.
 
     Args:
       task: the definition to run.
-      impl: "jax" for any device, "warp" for NVIDIA (on a CPU it is slow and serves tests only).
+      impl: "jax" for any device, "warp" for NVIDIA.
       max_episode_steps: time limit in environment steps.
       num_envs: environments stepped together on one device; they share Warp's room for contacts.
       contacts_per_env: that room divided by `num_envs`. Warp only.
       constraints_per_env: most constraint rows of one environment. Warp only.
+      warp_on_cpu: lets Warp run, slowly, without an NVIDIA device; for tests.
 
     Raises:
       ConfigError: a setting that MJX cannot run; names what works.
@@ -180,8 +177,8 @@ def make_engine(
         raise ConfigError("physics.solver: MJX has no PGS; set it to Newton")
     if impl not in ("jax", "warp"):
         raise ConfigError(f"mjx.impl: got {impl!r}; expected 'jax' or 'warp'")
-    if impl == "warp" and not _warp_installed():
-        raise ConfigError("mjx.impl: warp needs the package warp-lang; install mujoco-mjx[warp] or set mjx.impl to jax")
+    if impl == "warp":
+        _start_warp(warp_on_cpu)
     try:
         model = mjx.put_model(task.model, impl=impl)
     except NotImplementedError as error:
@@ -196,10 +193,20 @@ def make_engine(
     return MjxEngine(task, max_episode_steps, model, data, loops)
 
 
-def _warp_installed() -> bool:
-    from mujoco.mjx import warp
+def _start_warp(on_cpu: bool) -> None:
+    """Checks that Warp can run, and stops its line per compiled kernel.
 
-    return warp.WARP_INSTALLED
+    Raises:
+      ConfigError: it is not installed, or there is no NVIDIA device and `on_cpu` is not set.
+    """
+    if importlib.util.find_spec("warp") is None:
+        raise ConfigError("mjx.impl: warp needs the package warp-lang; install mujoco-mjx[warp] or set mjx.impl to jax")
+    device = jax.devices()[0]
+    if not on_cpu and "nvidia" not in device.device_kind.lower():
+        raise ConfigError(f"mjx.impl: warp needs an NVIDIA device, and JAX runs on {device}; set mjx.impl to jax")
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
 
 
 def _with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:

@@ -5,14 +5,18 @@ moves: the velocity-dependent part of a closed loop's reference acceleration, an
 damps nothing. Both are added here from the outside.
 """
 
+import contextlib
+import io
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from hasrl_jax.types import Array
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional Warp is missing
+    from mujoco import mjx
 
 
 class Loops(NamedTuple):

@@ -49,7 +49,8 @@ class Task:
     """One task: its model, sizes and functions."""
 
     name: str
-    model: mujoco.MjModel
+    asset: str  # file of the model in `assets`, for a copy with its visual shapes
+    model: mujoco.MjModel  # without visual shapes
     steps_per_env_step: int  # physics steps per environment step
     observation_size: int
     action_size: int

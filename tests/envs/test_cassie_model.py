@@ -265,8 +265,9 @@ def fall(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, targets: np.
 def test_a_mirrored_state_falls_as_the_mirror_image(model: mujoco.MjModel) -> None:
     """Tolerance 2e-3 (metres, radians): the legs mirror exactly, the pelvis does not.
 
-    Its centre of mass lies 0.35 mm left of the middle, which the fall amplifies to about 1e-3 in half a second; a
-    wrong sign in one joint, inertia or closure of a leg shows as 1e-2 or more.
+    Its centre of mass lies 0.35 mm left of the middle, which the fall amplifies to about 1e-3 in half a second. A wrong
+    joint axis or a closure 1 mm off exceeds the tolerance; a slip in one small inertia does not, and is left to
+    `test_body`.
     """
     rng = np.random.default_rng(0)
     qpos = model.key("stand").qpos.copy()
