@@ -10,6 +10,7 @@ import os
 import tempfile
 
 import numpy as np
+import psutil
 
 from hasrl_jax.collect.numpy_policy import Parameters, parameter_shapes
 from hasrl_jax.collect.plan import Plan
@@ -26,6 +27,12 @@ def create(size: int) -> int:
     Raises:
       OSError: the memory cannot be had; the message names the size.
     """
+    remedy = "lower collect.env_steps_per_iteration, collect.envs_per_worker or collect.unroll_length, or free memory"
+    available = psutil.virtual_memory().available
+    # The learner needs as much again. Asking for it would not fail but let the kernel kill some process.
+    if 2 * size > available:
+        found = f"{available / 2**20:.0f} MiB are available, and training needs twice as much"
+        raise OSError(f"cannot reserve {size / 2**20:.0f} MiB of shared memory for the workers ({found}); {remedy}")
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("hasrl_jax")
     else:  # not Linux: an unlinked temporary file serves the same purpose
@@ -40,8 +47,7 @@ def create(size: int) -> int:
         os.close(descriptor)
         raise OSError(
             error.errno,
-            f"cannot reserve {size / 2**20:.1f} MiB of shared memory for the workers ({error.strerror}); "
-            "lower collect.env_steps_per_iteration or free memory",
+            f"cannot reserve {size / 2**20:.0f} MiB of shared memory for the workers ({error.strerror}); {remedy}",
         ) from None
     return descriptor
 
