@@ -50,6 +50,7 @@ class CommandConfig:
     forward_m_s: tuple[float, float] = (-0.3, 2.0)  # range of the commanded forward speed, m/s
     lateral_m_s: tuple[float, float] = (-0.1, 0.1)  # range of the commanded lateral speed, m/s (left is positive)
     stand_probability: float = 0.1  # share of draws that command zero speed
+    start_moving: float = 0.0  # share of episodes that start at the commanded speed instead of at rest
     resample_s: tuple[float, float] = (2.0, 6.0)  # seconds between draws; (0, 0) keeps one draw per episode
 
 

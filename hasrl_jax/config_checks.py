@@ -57,8 +57,9 @@ def check(config: Config) -> None:
     _require(0 < ppo.clip < 1, "ppo.clip", ppo.clip, "between 0 and 1")
     _require(0 <= ppo.discount <= 1, "ppo.discount", ppo.discount, "from 0 to 1")
     _require(0 <= ppo.gae_lambda <= 1, "ppo.gae_lambda", ppo.gae_lambda, "from 0 to 1")
-    share = cassie.command.stand_probability
-    _require(0 <= share <= 1, "cassie.command.stand_probability", share, "from 0 to 1")
+    for name in ("stand_probability", "start_moving"):
+        share = getattr(cassie.command, name)
+        _require(0 <= share <= 1, f"cassie.command.{name}", share, "from 0 to 1")
     for group in ("command", "randomize"):
         settings = getattr(cassie, group)
         for f in dataclasses.fields(settings):

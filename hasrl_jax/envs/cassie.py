@@ -69,7 +69,7 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=OBSERVATION_SIZE,
         action_size=ACTION_SIZE,
-        reset_uniforms=randomize.num_uniforms(nominal) + COMMAND_UNIFORMS + 1 + NUM_ENCODERS,
+        reset_uniforms=randomize.num_uniforms(nominal) + COMMAND_UNIFORMS + 2 + NUM_ENCODERS,
         step_uniforms=COMMAND_UNIFORMS,
         reward_terms=rewards.TERMS,
         measures=MEASURES,
@@ -82,11 +82,11 @@ def make(config: Config) -> Task:
 
 
 def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
-    """A fresh episode at rest in the initial pose, from uniform numbers [..., reset_uniforms]."""
+    """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
-    cuts = np.cumsum([randomize.num_uniforms(nominal), COMMAND_UNIFORMS, 1])
-    model_u, command_u, phase_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
+    cuts = np.cumsum([randomize.num_uniforms(nominal), COMMAND_UNIFORMS, 1, 1])
+    model_u, command_u, phase_u, start_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
 
     fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
@@ -103,8 +103,9 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         env_step_s=timestep * constants.steps_per_env_step,
     )
     qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
-    qvel = xp.zeros((*batch, len(nominal.dof_damping)))
-    # The robot starts at rest, so the first observation needs no physics.
+    start_velocity = xp.where(start_u < config.command.start_moving, command, 0.0)
+    qvel = xp.concatenate([start_velocity, xp.zeros((*batch, len(nominal.dof_damping) - 2))], axis=-1)
+    # Nothing accelerates yet, so the first observation needs no physics.
     observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), xp)
     return Reset(state, observation, qpos, qvel, fields)
 

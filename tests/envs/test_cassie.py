@@ -97,6 +97,16 @@ def test_reset_observation_is_the_initial_pose_at_rest() -> None:
     assert len(set(fresh.state.phase)) == 4  # the gait starts anywhere in its cycle
 
 
+def test_a_share_of_episodes_starts_at_the_commanded_speed() -> None:
+    task, _ = _make(command={"start_moving": 0.5})
+    fresh = task.reset(np.random.default_rng(0).random((400, task.reset_uniforms)), np)
+    moving = fresh.qvel.any(axis=-1)
+    commanded = fresh.state.command.any(axis=-1)
+    np.testing.assert_array_equal(fresh.qvel[moving, :2], fresh.state.command[moving])
+    assert 0.4 < moving[commanded].mean() < 0.6
+    assert not fresh.qvel[:, 2:].any()
+
+
 def _mirror_physics(task: Task, physics: np.ndarray) -> np.ndarray:
     """The mirror image of (time, qpos, qvel), by joint name."""
     model, mirrored = task.model, physics.copy()
