@@ -1,17 +1,30 @@
 """The ways to collect behind one interface, so that the training loop cannot tell them apart."""
 
-from typing import NamedTuple, Protocol
+import io
+import logging
+import os
+import time
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hasrl_jax.collect.cpu_pool import Collected, CpuPool
-from hasrl_jax.collect.plan import Plan
+from hasrl_jax.collect.mjx import ActingParameters, MjxCollector, Statistics, make_mjx_plan
+from hasrl_jax.collect.plan import Plan, make_plan
 from hasrl_jax.config import Config
+from hasrl_jax.envs.mjx_env import make_engine
 from hasrl_jax.envs.task import Task
-from hasrl_jax.learn import ppo
+from hasrl_jax.learn import normalize, ppo
 from hasrl_jax.learn.batching import pad_segments
+from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.metrics import Record
 from hasrl_jax.types import Trajectory
+
+log = logging.getLogger("hasrl_jax")
 
 
 class Experience(NamedTuple):
@@ -27,6 +40,7 @@ class Collector(Protocol):
     """What the training loop asks of a collector; a context manager that frees everything on exit."""
 
     busy: bool  # between `start` and `finish`
+    description: str  # one line for the start of a run
 
     def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
         """Asks for one iteration's experience with the learner's present parameters; returns at once."""
@@ -45,15 +59,24 @@ class Collector(Protocol):
     def __exit__(self, *error: object) -> None: ...
 
 
-class CpuCollector:
+def make_collector(config: Config, task: Task, mesh: Mesh) -> Collector:
+    """The collector of `config.backend`."""
+    return CpuExperience(config, task) if config.backend == "cpu_pool" else MjxExperience(config, task, mesh)
+
+
+class CpuExperience:
     """A `CpuPool` whose buffers come out as padded trajectories."""
 
-    def __init__(self, config: Config, plan: Plan, task: Task):
-        self.plan = plan
-        self.pool = CpuPool(config, plan, task)
+    def __init__(self, config: Config, task: Task):
+        self.plan = make_plan(config)
+        self.pool = CpuPool(config, self.plan, task)
         self.save, self.load = self.pool.save, self.pool.load
+        self.description = (
+            f"{self.plan.num_workers} workers x {self.plan.envs_per_worker} environments, "
+            f"{self.plan.env_steps} environment steps per iteration"
+        )
 
-    def __enter__(self) -> "CpuCollector":
+    def __enter__(self) -> "CpuExperience":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -68,8 +91,64 @@ class CpuCollector:
 
     def finish(self) -> Experience:
         collected = self.pool.finish()
-        record = collection_record(collected) | {"workers_lost": self.pool.workers_lost}
+        record = cpu_record(collected) | {"workers_lost": self.pool.workers_lost}
         return Experience(to_trajectory(collected, self.plan), len(collected.fields["mask"]), collected.version, record)
+
+
+class MjxExperience:
+    """MJX environments on the learner's devices; the trajectories never leave them."""
+
+    def __init__(self, config: Config, task: Task, mesh: Mesh):
+        self.plan = make_mjx_plan(config, config.mjx.num_envs, mesh.size)
+        settings = config.mjx
+        limits = settings.contacts_per_env, settings.constraints_per_env
+        cap = config.collect.max_episode_steps
+        engine = make_engine(task, settings.impl, cap, settings.num_envs // mesh.size, *limits)
+        networks = make_networks(config.network, task.observation_size, task.action_size, task.mirror)
+        self.collector = MjxCollector(self.plan, engine, *networks, mesh)
+        self.state = self.collector.init(config.seed)
+        self.normalizes, self.reward_terms = config.network.normalize_observations, task.reward_terms
+        self.busy, self._pending, self._version, self._started = False, (), 0, 0.0
+        self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {self.plan.env_steps} environment steps per iteration"
+
+    def __enter__(self) -> "MjxExperience":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass  # arrays are freed with the object
+
+    def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
+        del iteration  # the environments' own keys move on with them
+        statistics = normalize.mean_std(learner.normalizer, self.normalizes)
+        # Copied, because the update donates the learner's arrays while this program may still read them.
+        parameters = jax.tree.map(jnp.copy, ActingParameters(learner.policy_params, learner.value_params, *statistics))
+        self._pending = self.collector(parameters, self.state, version)
+        self.busy, self._version, self._started = True, version, time.monotonic()
+
+    def finish(self) -> Experience:
+        self.state, trajectory, sums = self._pending
+        statistics: Statistics = jax.device_get(sums)  # waits for the collection
+        self.busy, self._pending = False, ()
+        if not statistics.valid_steps:
+            raise FloatingPointError("every MJX environment diverged; the policy's actions are probably not finite")
+        record = mjx_record(statistics, self.reward_terms) | {"collect_seconds": time.monotonic() - self._started}
+        return Experience(trajectory, self.plan.env_steps, self._version, record)
+
+    def save(self) -> list[bytes]:
+        buffer = io.BytesIO()
+        np.savez(buffer, *(np.asarray(leaf) for leaf in jax.tree.leaves(self.state)))
+        return [buffer.getvalue()]
+
+    def load(self, states: list[bytes]) -> None:
+        leaves, structure = jax.tree.flatten(self.state)
+        saved: list[Any] = []
+        if len(states) == 1:
+            with np.load(io.BytesIO(states[0]), allow_pickle=False) as file:
+                saved = [file[name] for name in file.files]
+        if [array.shape for array in saved] == [leaf.shape for leaf in leaves]:
+            self.state = jax.tree.unflatten(structure, saved)
+        elif states:
+            log.warning("the saved environments are of another number or backend: all episodes begin anew")
 
 
 def to_trajectory(collected: Collected, plan: Plan) -> Trajectory:
@@ -80,7 +159,7 @@ def to_trajectory(collected: Collected, plan: Plan) -> Trajectory:
     return pad_segments(fields, collected.start, collected.end, plan.max_length, rows)
 
 
-def collection_record(collected: Collected) -> Record:
+def cpu_record(collected: Collected) -> Record:
     """The metrics of a collection under the names of the metrics file; None without a finished episode."""
     ended = collected.fields["episode_length"] > 0
     terms = [statistics["reward_terms"] for statistics in collected.statistics]
@@ -91,3 +170,37 @@ def collection_record(collected: Collected) -> Record:
         "diverged_envs": sum(statistics["diverged"] for statistics in collected.statistics),
         **{f"reward/{name}": float(np.mean([term[name] for term in terms])) for name in terms[0]},
     }
+
+
+def mjx_record(statistics: Statistics, reward_terms: tuple[str, ...]) -> Record:
+    """As `cpu_record`; also counts the steps in which Warp ran out of room."""
+    episodes = int(statistics.episodes)
+    means = statistics.reward_terms / statistics.valid_steps
+    return {
+        "episode_return_train": float(statistics.episode_return) / episodes if episodes else None,
+        "episode_length_train": float(statistics.episode_length) / episodes if episodes else None,
+        "diverged_envs": int(statistics.diverged),
+        "contact_overflow": int(statistics.contact_overflow),
+        "constraint_overflow": int(statistics.constraint_overflow),
+        **{f"reward/{name}": float(mean) for name, mean in zip(reward_terms, means, strict=True)},
+    }
+
+
+def prepare_jax(config: Config) -> None:
+    """Settings that must be made before JAX first touches a device."""
+    if config.backend == "mjx":
+        # XLA's thread pool on few CPU cores can wait for itself for ever in batched matrix factorisations.
+        os.environ.setdefault("NPROC", "1")
+    if config.compilation_cache:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hasrl_jax" / "compiled"
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            jax.config.update("jax_compilation_cache_dir", str(cache))
+        except OSError as error:
+            log.warning("%s: programs are compiled anew at every start (%s)", cache, error.strerror)
+    if config.backend == "mjx" and jax.default_backend() == "cpu":
+        log.warning(
+            "the mjx backend has no accelerator here: one CPU core runs about 530 environment steps/s with MJX and "
+            "about 3,300 with --backend=cpu_pool; NPROC=%s keeps XLA from hanging on few cores",
+            os.environ["NPROC"],
+        )

@@ -131,6 +131,14 @@ class CollectConfig:
 
 
 @dataclass(frozen=True)
+class MjxConfig:
+    num_envs: int = 2048  # environments over all devices, a multiple of their number
+    impl: Literal["jax", "warp"] = "jax"  # any device, or MuJoCo Warp on NVIDIA
+    contacts_per_env: int = 16  # Warp: room for contacts, shared by a device's environments, per environment
+    constraints_per_env: int = 64  # Warp: most constraint rows of one environment
+
+
+@dataclass(frozen=True)
 class PPOConfig:
     epochs: int = 5  # passes over the data of an iteration
     minibatch_trajectories: int = 64  # trajectories per minibatch
@@ -165,15 +173,17 @@ class CheckpointConfig:
 @dataclass(frozen=True)
 class Config:
     task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
-    backend: Literal["cpu_pool"] = "cpu_pool"  # where experience is collected
+    backend: Literal["cpu_pool", "mjx"] = "cpu_pool"  # collect in CPU processes, or on the accelerator
     schedule: Literal["sync", "overlap"] = "sync"  # collect then train, or collect while training
     seed: int = 0  # seeds every random stream
     total_env_steps: int = 50_000_000  # training ends after this many environment steps
+    compilation_cache: bool = True  # keep compiled programs in the user's cache directory
     run_dir: str = ""  # where the run is written; empty makes runs/<task>-<time>
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     cassie: CassieConfig = field(default_factory=CassieConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
+    mjx: MjxConfig = field(default_factory=MjxConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)

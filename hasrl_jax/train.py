@@ -14,8 +14,7 @@ import jax
 
 from hasrl_jax import checkpoint, cli
 from hasrl_jax.collect.cpu_pool import WorkerError
-from hasrl_jax.collect.plan import Plan, make_plan
-from hasrl_jax.collectors import CpuCollector
+from hasrl_jax.collectors import Collector, make_collector, prepare_jax
 from hasrl_jax.config import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
@@ -38,7 +37,8 @@ class Progress(NamedTuple):
 
 def train(config: Config, resume: bool = False) -> None:
     """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM."""
-    task, plan, mesh = make_task(config), make_plan(config), ppo.make_mesh()
+    prepare_jax(config)
+    task, mesh = make_task(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
     with open_run(config, resume) as run, stop_signal() as stop:
         learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
@@ -48,12 +48,12 @@ def train(config: Config, resume: bool = False) -> None:
             loaded = checkpoint.load(run.checkpoints, learner)
             learner, progress, env_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
             write_config(run.path, config)  # some settings may differ from now on
-        announce(config, plan, task, run.path, progress)
         with (
-            CpuCollector(config, plan, task) as collector,
+            make_collector(config, task, mesh) as collector,
             MetricsWriter(run.path, progress.iteration) as writer,
             ProgressPrinter(config.total_env_steps, progress.env_steps) as printer,
         ):
+            announce(config, collector, task, run.path, progress)
             collector.load(env_states)
             while progress.env_steps < config.total_env_steps and not stop:
                 started = time.monotonic()
@@ -116,15 +116,13 @@ def due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
 
 
-def announce(config: Config, plan: Plan, task: Task, run_dir: Path, progress: Progress) -> None:
+def announce(config: Config, collector: Collector, task: Task, run_dir: Path, progress: Progress) -> None:
     """The first lines of a run: what runs where, and how fast the physics is sampled."""
     devices = ", ".join(str(device) for device in jax.devices())
     log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
     log.info(
-        "%d workers x %d environments, %d environment steps per iteration; physics %.0f Hz, policy %.0f Hz",
-        plan.num_workers,
-        plan.envs_per_worker,
-        plan.env_steps,
+        "%s; physics %.0f Hz, policy %.0f Hz",
+        collector.description,
         1 / task.model.opt.timestep,
         1 / task.env_step_s,
     )

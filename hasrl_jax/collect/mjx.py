@@ -197,8 +197,8 @@ class MjxCollector:
 
         def unroll(state: CollectorState, _: None) -> tuple[CollectorState, tuple[Array, _Step]]:
             keep = ~state.envs.is_first[:, None, None, None]
-            return_state, steps = jax.lax.scan(env_step, state, None, length=self.plan.max_length)
-            return return_state, (jnp.where(keep, state.carry, 0.0), steps)
+            next_state, steps = jax.lax.scan(env_step, state, None, length=self.plan.max_length)
+            return next_state, (jnp.where(keep, state.carry, 0.0), steps)
 
         pieces = self.plan.steps_per_env // self.plan.max_length
         state, (carries, steps) = jax.lax.scan(unroll, state, None, length=pieces)
