@@ -1,19 +1,26 @@
 """Command lines: a YAML file, then dotted overrides of any config field, then the checks."""
 
-import argparse
+import contextlib
+import difflib
+import io
+import itertools
 import logging
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from hasrl_jax import config as config_module
 from hasrl_jax import config_checks
+from hasrl_jax.arguments import OneLineParser
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.config import Config, ConfigError
 
 SHORTHAND = {"--num-workers": "--collect.num-workers"}
+OVERRIDABLE_FOR_A_POLICY = ("physics", "cassie")  # what can differ from the training of a policy that is played
 
 
 def parse_train(arguments: list[str]) -> tuple[Config, bool]:
@@ -27,12 +34,14 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
     """
     from hasrl_jax.run_directory import load_run_config
 
-    parser = argparse.ArgumentParser(prog="python -m hasrl_jax.train", add_help=False, allow_abbrev=False)
+    parser = OneLineParser(prog="python -m hasrl_jax.train", add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path, default=None, metavar="FILE")
     parser.add_argument("--resume", type=Path, default=None, metavar="DIR")
     known, rest = parser.parse_known_args(arguments)
     if known.config and known.resume:
         raise ConfigError("--config and --resume: give one of them; a resumed run brings its own configuration")
+    if known.resume and any(_option(argument) == "--run-dir" for argument in rest):
+        raise ConfigError("--resume and --run-dir: give only --resume; a resumed run goes on in its own directory")
     base = (
         load_run_config(known.resume)
         if known.resume
@@ -45,17 +54,43 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
 
 
 def override(base: Config, arguments: list[str], program: str) -> Config:
-    """`base` with the fields that the arguments name replaced, and checked."""
+    """`base` with the fields that the arguments name replaced, and checked.
+
+    Raises:
+      ConfigError: an unknown option or an impossible value, on one line.
+    """
     arguments = [_expand(argument) for argument in arguments]
-    config = tyro.cli(
-        Config,
-        default=base,
-        args=arguments,
-        prog=f"python -m hasrl_jax.{program}",
-        description="Train a policy. Also: --config FILE, --resume DIR, --num-workers N.",
-        config=(tyro.conf.FlagConversionOff,),
-    )
+    _refuse_unknown_options(arguments)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            config = tyro.cli(
+                Config,
+                default=base,
+                args=arguments,
+                prog=f"python -m hasrl_jax.{program}",
+                description="Train a policy. Also: --config FILE, --resume DIR, --num-workers N.",
+                config=(tyro.conf.FlagConversionOff,),
+            )
+    except SystemExit as stopped:
+        if not stopped.code:  # --help
+            raise
+        raise ConfigError(_one_line(complaint.getvalue())) from None
+    config = config_module.from_dict(config_module.to_dict(config))  # as strict as YAML: only finite numbers
     config_checks.check(config)
+    return config
+
+
+def override_for_policy(trained: Config, arguments: list[str], program: str) -> Config:
+    """As `override`, for playing a policy: what it was trained as stays.
+
+    Raises:
+      ConfigError: also for an override of anything but the physics and the walking task's settings.
+    """
+    config = override(trained, arguments, program)
+    for name, value in config_module.to_dict(trained).items():
+        if name not in OVERRIDABLE_FOR_A_POLICY and config_module.to_dict(config)[name] != value:
+            raise ConfigError(f"{name}: a trained policy fixes it; only physics and cassie settings can be overridden")
     return config
 
 
@@ -72,6 +107,9 @@ def run(job: Callable[[], None]) -> int:
     except (RunError, CheckpointError, WorkerError, FloatingPointError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except MemoryError as error:
+        print(f"error: out of memory ({error or 'no detail'})", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -87,6 +125,40 @@ def log_to_terminal() -> None:
         logger.addHandler(logging.StreamHandler())
 
 
+def _option(argument: str) -> str:
+    """The name of an option, as it is documented: without a value, with hyphens."""
+    return argument.partition("=")[0].replace("_", "-")
+
+
 def _expand(argument: str) -> str:
     name, equals, value = argument.partition("=")
-    return SHORTHAND.get(name, name) + equals + value
+    return SHORTHAND.get(_option(argument), name) + equals + value
+
+
+def _options(settings: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+    """The option of every config field."""
+    for name, value in settings.items():
+        option = prefix + name.replace("_", "-")
+        if isinstance(value, dict):
+            yield from _options(value, option + ".")
+        else:
+            yield option
+
+
+def _refuse_unknown_options(arguments: list[str]) -> None:
+    known = list(_options(config_module.to_dict(Config())))
+    for argument in arguments:
+        option = _option(argument)
+        if option.startswith("--") and option not in {*known, "--help"}:
+            closest = difflib.get_close_matches(option, known, n=1)
+            hint = f"did you mean {closest[0]}?" if closest else "see --help"
+            raise ConfigError(f"{argument.partition('=')[0]}: unknown option; {hint}")
+
+
+def _one_line(complaint: str) -> str:
+    """The text of tyro's framed complaint, without its frame, its title and the help below it."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
+    lines = [line.strip(" │╭╮╰╯─") for line in plain.splitlines()][1:]
+    blocks = itertools.groupby(lines, lambda line: bool(line.strip("-")))  # rules separate them
+    first = next((" ".join(block) for has_text, block in blocks if has_text), "")
+    return first or " ".join(plain.split())

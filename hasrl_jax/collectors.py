@@ -39,8 +39,11 @@ class Experience(NamedTuple):
 class Collector(Protocol):
     """What the training loop asks of a collector; a context manager that frees everything on exit."""
 
-    busy: bool  # between `start` and `finish`
     description: str  # one line for the start of a run
+
+    @property
+    def busy(self) -> bool:
+        """Between `start` and `finish`."""
 
     def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
         """Asks for one iteration's experience with the learner's present parameters; returns at once."""
@@ -68,9 +71,8 @@ class CpuExperience:
     """A `CpuPool` whose buffers come out as padded trajectories."""
 
     def __init__(self, config: Config, task: Task):
-        self.plan = make_plan(config)
+        self.plan, self.normalizes = make_plan(config), config.network.normalize_observations
         self.pool = CpuPool(config, self.plan, task)
-        self.save, self.load = self.pool.save, self.pool.load
         self.description = (
             f"{self.plan.num_workers} workers x {self.plan.envs_per_worker} environments, "
             f"{self.plan.env_steps} environment steps per iteration"
@@ -87,12 +89,18 @@ class CpuExperience:
         return self.pool.busy
 
     def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
-        self.pool.start(ppo.export_parameters(learner), iteration, version)
+        self.pool.start(ppo.export_parameters(learner, self.normalizes), iteration, version)
 
     def finish(self) -> Experience:
         collected = self.pool.finish()
         record = cpu_record(collected) | {"workers_lost": self.pool.workers_lost}
         return Experience(to_trajectory(collected, self.plan), len(collected.fields["mask"]), collected.version, record)
+
+    def save(self) -> list[bytes]:
+        return self.pool.save()
+
+    def load(self, states: list[bytes]) -> None:
+        self.pool.load(states)
 
 
 class MjxExperience:
@@ -108,7 +116,8 @@ class MjxExperience:
         self.collector = MjxCollector(self.plan, engine, *networks, mesh)
         self.state = self.collector.init(config.seed)
         self.normalizes, self.reward_terms = config.network.normalize_observations, task.reward_terms
-        self.busy, self._pending, self._version, self._started = False, (), 0, 0.0
+        self.busy, self._version, self._started = False, 0, 0.0
+        self._pending: Any = None  # between `start` and `finish`
         self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {self.plan.env_steps} environment steps per iteration"
 
     def __enter__(self) -> "MjxExperience":
@@ -128,7 +137,7 @@ class MjxExperience:
     def finish(self) -> Experience:
         self.state, trajectory, sums = self._pending
         statistics: Statistics = jax.device_get(sums)  # waits for the collection
-        self.busy, self._pending = False, ()
+        self.busy, self._pending = False, None
         if not statistics.valid_steps:
             raise FloatingPointError("every MJX environment diverged; the policy's actions are probably not finite")
         record = mjx_record(statistics, self.reward_terms) | {"collect_seconds": time.monotonic() - self._started}

@@ -21,14 +21,15 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _default_config() -> Path:
-    """configs/cassie_walk.yaml, beside the package in a checkout and inside it in a wheel."""
+def _config_folder() -> Path:
+    """configs/, beside the package in a checkout and inside it in a wheel."""
     package = Path(__file__).parent
     folders = package.parent / "configs", package / "configs"
-    return next((folder for folder in folders if folder.is_dir()), folders[0]) / "cassie_walk.yaml"
+    return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
-DEFAULT_CONFIG = _default_config()
+CONFIG_FOLDER = _config_folder()
+DEFAULT_CONFIG = CONFIG_FOLDER / "cassie_walk.yaml"
 
 
 class ConfigError(ValueError):
@@ -86,9 +87,9 @@ class RandomizeConfig:
     enabled: bool = True  # draw the model anew at each reset
     damping_scale: tuple[float, float] = (0.3, 5.0)  # joint damping factor, per leg joint
     mass_scale: tuple[float, float] = (0.5, 1.5)  # mass and inertia factor, per body
-    sliding_friction: tuple[float, float] = (0.4, 1.1)  # one draw for the ground
-    torsional_friction: tuple[float, float] = (1e-4, 5e-4)  # one draw for the ground, m
-    rolling_friction: tuple[float, float] = (1e-4, 2e-4)  # one draw for the ground, m
+    sliding_friction: tuple[float, float] = (0.4, 1.1)  # one draw for all geoms
+    torsional_friction: tuple[float, float] = (1e-4, 5e-4)  # one draw for all geoms, m
+    rolling_friction: tuple[float, float] = (1e-4, 2e-4)  # one draw for all geoms, m
     encoder_offset_rad: float = 0.01  # half width of the encoder offset, per joint, constant in an episode, rad
     physics_rate_scale: tuple[float, float] = (0.6, 1.2)  # factor on the physics step, hence the policy period
 
@@ -210,7 +211,7 @@ def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
     """
     base = Config() if base is None else base
     if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected a mapping of fields, got {values!r}")
+        raise ConfigError(f"{where}: expected a mapping of fields, got {shown(values)}")
     hints = typing.get_type_hints(type(base))
     changes = {}
     for key, value in values.items():
@@ -230,37 +231,67 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
     if origin is Literal:
         if value in args:
             return value
-        raise ConfigError(f"{path}: got {value!r}; expected one of {', '.join(map(repr, args))}")
+        raise ConfigError(f"{path}: got {shown(value)}; expected one of {', '.join(map(repr, args))}")
     if origin is tuple:
         if isinstance(value, list | tuple) and len(value) == len(args):
             return tuple(_convert(v, a, f"{path}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
-        raise ConfigError(f"{path}: got {value!r}; expected a list of {len(args)} numbers")
+        raise ConfigError(f"{path}: got {shown(value)}; expected a list of {len(args)} numbers")
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
         with contextlib.suppress(ValueError):
             value = float(value)
     accepted: Any = {float: (int, float), int: int, bool: bool, str: str}[hint]
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{path}: got {value!r}; expected {hint.__name__}")
-    if hint is float and not math.isfinite(value):
-        raise ConfigError(f"{path}: got {value!r}; expected a finite number")
+        raise ConfigError(f"{path}: got {shown(value)}; expected {hint.__name__}")
+    try:
+        finite = math.isfinite(value) if hint is float else True
+    except OverflowError:  # an integer beyond the largest float
+        finite = False
+    if not finite:
+        raise ConfigError(f"{path}: got {shown(value)}; expected a finite number")
     return hint(value)
+
+
+def shown(value: Any) -> str:
+    """`value` as an error message shows it: on one line, and short."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to write integers of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses a key that stands twice in one mapping, where plain YAML lets the last one win."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen and isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands twice", key.start_mark)
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else id(key))
+        return super().construct_mapping(node, deep)
 
 
 def load_yaml(path: str | Path) -> Config:
     """Reads a YAML file over the defaults.
 
     Raises:
-      ConfigError: missing or unreadable file, invalid YAML, unknown or impossible values.
+      ConfigError: missing or unreadable file, invalid YAML, a key given twice, unknown fields or wrong types.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--config {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        values = yaml.load(text, _StrictLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or a number that cannot be
         raise ConfigError(f"--config {path}: not valid YAML ({' '.join(str(error).split())})") from None
-    return from_dict(values or {}, where=Path(path).name)
+    return from_dict({} if values is None else values, where=Path(path).name)
+
+
+def shipped(name: str) -> Config:
+    """The configuration of `configs/<name>.yaml`."""
+    return load_yaml(CONFIG_FOLDER / f"{name}.yaml")
 
 
 def dump_yaml(config: Config) -> str:

@@ -1,9 +1,79 @@
 """Rejects configurations that cannot work, before anything compiles or starts."""
 
-import dataclasses
 from typing import Any
 
-from hasrl_jax.config import Config, ConfigError
+from hasrl_jax.config import CassieConfig, Config, ConfigError, shown
+
+# Lowest and highest value of every numeric field, both included; of a range, for both of its ends.
+LIMITS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**63 - 1),
+    "total_env_steps": (1, 10**15),
+    "physics.timestep_s": (1e-5, 0.01),
+    "physics.steps_per_env_step": (1, 10_000),
+    "physics.solver_iterations": (1, 10_000),
+    "physics.line_search_iterations": (1, 10_000),
+    "cassie.command.forward_m_s": (-10, 10),
+    "cassie.command.lateral_m_s": (-10, 10),
+    "cassie.command.stand_probability": (0, 1),
+    "cassie.command.start_moving": (0, 1),
+    "cassie.command.resample_s": (0, 1e6),
+    "cassie.clock.cycle_s": (0.1, 10),
+    "cassie.clock.cycle_per_speed_s": (-10, 10),
+    "cassie.clock.swing_fraction": (0.05, 0.95),
+    "cassie.clock.swing_fraction_per_speed": (-10, 10),
+    "cassie.clock.max_swing_fraction": (0.05, 0.95),
+    "cassie.reward.scale": (1e-6, 1e6),
+    "cassie.reward.foot_force": (-1e6, 1e6),
+    "cassie.reward.foot_velocity": (-1e6, 1e6),
+    "cassie.reward.orientation": (-1e6, 1e6),
+    "cassie.reward.pelvis_motion": (-1e6, 1e6),
+    "cassie.reward.velocity": (-1e6, 1e6),
+    "cassie.reward.hip_roll": (-1e6, 1e6),
+    "cassie.reward.torque_change": (-1e6, 1e6),
+    "cassie.reward.action_change": (-1e6, 1e6),
+    "cassie.reward.velocity_sharpness": (0, 1e3),
+    "cassie.reward.lateral_velocity_share": (0, 1e3),
+    "cassie.reward.height_m": (0, 2),
+    "cassie.reward.shaking": (0, 1e3),
+    "cassie.randomize.damping_scale": (0, 100),
+    "cassie.randomize.mass_scale": (0.01, 100),
+    "cassie.randomize.sliding_friction": (0, 10),
+    "cassie.randomize.torsional_friction": (0, 1),
+    "cassie.randomize.rolling_friction": (0, 1),
+    "cassie.randomize.encoder_offset_rad": (0, 1),
+    "cassie.randomize.physics_rate_scale": (0.05, 10),
+    "cassie.termination.min_height_m": (0, 1),  # the robot starts at 1.01 m
+    "cassie.termination.max_height_m": (1.02, 1e3),
+    "cassie.termination.max_tilt_deg": (1, 180),
+    "network.hidden_size": (1, 8192),
+    "network.initial_log_std": (-10, 3),
+    "collect.num_workers": (1, 4096),
+    "collect.envs_per_worker": (1, 65536),
+    "collect.env_steps_per_iteration": (1, 10**9),
+    "collect.unroll_length": (1, 10**6),
+    "collect.max_episode_steps": (1, 10**6),
+    "collect.worker_start_timeout_s": (1, 86400),
+    "collect.worker_timeout_s": (1, 86400),
+    "mjx.num_envs": (1, 10**6),
+    "mjx.contacts_per_env": (1, 10_000),
+    "mjx.constraints_per_env": (1, 10_000),
+    "ppo.epochs": (1, 1000),
+    "ppo.minibatch_trajectories": (1, 10**6),
+    "ppo.policy_learning_rate": (1e-12, 1),
+    "ppo.value_learning_rate": (1e-12, 1),
+    "ppo.adam_epsilon": (1e-16, 1),
+    "ppo.max_gradient_norm": (1e-6, 1e9),
+    "ppo.clip": (0.001, 0.999),
+    "ppo.entropy_coefficient": (0, 1e3),
+    "ppo.value_coefficient": (1e-6, 1e6),
+    "ppo.discount": (0, 1),
+    "ppo.gae_lambda": (0, 1),
+    "ppo.max_kl": (0, 1e6),
+    "evaluate.every_iterations": (0, 10**9),
+    "evaluate.episodes": (1, 10**5),
+    "checkpoint.every_iterations": (0, 10**9),
+    "checkpoint.keep": (1, 10**6),
+}
 
 
 def check(config: Config) -> None:
@@ -12,80 +82,47 @@ def check(config: Config) -> None:
     Raises:
       ConfigError: names the field, the value seen and what would work.
     """
-    collect, ppo, physics, cassie = config.collect, config.ppo, config.physics, config.cassie
-    at_least_one = {
-        "total_env_steps": config.total_env_steps,
-        "physics.steps_per_env_step": physics.steps_per_env_step,
-        "physics.solver_iterations": physics.solver_iterations,
-        "physics.line_search_iterations": physics.line_search_iterations,
-        "network.hidden_size": config.network.hidden_size,
-        "collect.num_workers": collect.num_workers,
-        "collect.envs_per_worker": collect.envs_per_worker,
-        "collect.env_steps_per_iteration": collect.env_steps_per_iteration,
-        "collect.unroll_length": collect.unroll_length,
-        "collect.max_episode_steps": collect.max_episode_steps,
-        "mjx.num_envs": config.mjx.num_envs,
-        "mjx.contacts_per_env": config.mjx.contacts_per_env,
-        "mjx.constraints_per_env": config.mjx.constraints_per_env,
-        "ppo.epochs": ppo.epochs,
-        "ppo.minibatch_trajectories": ppo.minibatch_trajectories,
-        "evaluate.episodes": config.evaluate.episodes,
-        "checkpoint.keep": config.checkpoint.keep,
-    }
-    for name, count in at_least_one.items():
-        _require(count >= 1, name, count, "at least 1")
-    positive = {
-        "collect.worker_start_timeout_s": collect.worker_start_timeout_s,
-        "collect.worker_timeout_s": collect.worker_timeout_s,
-        "ppo.policy_learning_rate": ppo.policy_learning_rate,
-        "ppo.value_learning_rate": ppo.value_learning_rate,
-        "ppo.adam_epsilon": ppo.adam_epsilon,
-        "ppo.max_gradient_norm": ppo.max_gradient_norm,
-        "ppo.value_coefficient": ppo.value_coefficient,
-        "cassie.clock.cycle_s": cassie.clock.cycle_s,
-    }
-    for name, value in positive.items():
-        _require(value > 0, name, value, "a number above 0")
-    not_negative = {
-        "seed": config.seed,
-        "ppo.max_kl": ppo.max_kl,
-        "ppo.entropy_coefficient": ppo.entropy_coefficient,
-        "evaluate.every_iterations": config.evaluate.every_iterations,
-        "checkpoint.every_iterations": config.checkpoint.every_iterations,
-        "cassie.randomize.encoder_offset_rad": cassie.randomize.encoder_offset_rad,
-    }
-    for name, value in not_negative.items():
-        _require(value >= 0, name, value, "0 or more")
-    _require(1e-5 <= physics.timestep_s <= 0.01, "physics.timestep_s", physics.timestep_s, "between 1e-5 and 0.01 s")
-    _require(0 < ppo.clip < 1, "ppo.clip", ppo.clip, "between 0 and 1")
-    _require(0 <= ppo.discount <= 1, "ppo.discount", ppo.discount, "from 0 to 1")
-    _require(0 <= ppo.gae_lambda <= 1, "ppo.gae_lambda", ppo.gae_lambda, "from 0 to 1")
-    for name in ("stand_probability", "start_moving"):
-        share = getattr(cassie.command, name)
-        _require(0 <= share <= 1, f"cassie.command.{name}", share, "from 0 to 1")
-    for group in ("command", "randomize"):
-        settings = getattr(cassie, group)
-        for f in dataclasses.fields(settings):
-            value = getattr(settings, f.name)
-            if isinstance(value, tuple):
-                _require(value[0] <= value[1], f"cassie.{group}.{f.name}", value, "low <= high")
+    for name in LIMITS:
+        value: Any = config
+        for part in name.split("."):
+            value = getattr(value, part)
+        check_number(name, name, value)
+    _check_cassie(config.cassie)
+    if config.task == "cassie" and config.cassie.randomize.enabled:
+        scale, timestep_s = config.cassie.randomize.physics_rate_scale, config.physics.timestep_s
+        low, high = LIMITS["physics.timestep_s"]
+        _require(
+            low <= timestep_s * scale[0] and timestep_s * scale[1] <= high,
+            "cassie.randomize.physics_rate_scale",
+            scale,
+            f"physics steps from {low:g} to {high:g} s, where physics.timestep_s is {timestep_s:g}",
+        )
+
+
+def check_number(name: str, field: str, value: Any) -> None:
+    """Rejects a number, or a (low, high) pair of numbers, outside the limits of `field`; the message names `name`."""
+    low, high = LIMITS[field]
+    ends = value if isinstance(value, tuple) else (value,)
+    # Never true of NaN.
+    _require(all(low <= end <= high for end in ends), name, value, f"{_number(low)} to {_number(high)}")
+    _require(ends[0] <= ends[-1], name, value, "low <= high")
+
+
+def _check_cassie(cassie: CassieConfig) -> None:
+    """What must fit together among the settings of the walking task."""
     fastest = max(abs(speed) for speed in cassie.command.forward_m_s)
-    cycle = cassie.clock.cycle_s + cassie.clock.cycle_per_speed_s * fastest
     _require(
-        cycle > 0.1,
+        cassie.clock.cycle_s + cassie.clock.cycle_per_speed_s * fastest > 0.1,
         "cassie.clock.cycle_per_speed_s",
         cassie.clock.cycle_per_speed_s,
         f"a gait cycle above 0.1 s at {fastest:g} m/s",
     )
-    limits = cassie.termination
-    _require(
-        limits.min_height_m < limits.max_height_m,
-        "cassie.termination.min_height_m",
-        limits.min_height_m,
-        "less than max_height_m",
-    )
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def _require(condition: bool, name: str, value: Any, expected: str) -> None:
     if not condition:
-        raise ConfigError(f"{name}: got {value!r}; expected {expected}")
+        raise ConfigError(f"{name}: got {shown(value)}; expected {expected}")

@@ -1,6 +1,5 @@
 """Runs a policy for whole episodes and reports what it can do: `python -m hasrl_jax.evaluate`."""
 
-import argparse
 import json
 import sys
 from pathlib import Path
@@ -9,14 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax import cli
+from hasrl_jax.arguments import OneLineParser, require_writable
 from hasrl_jax.collect import numpy_policy
-from hasrl_jax.config import Config, ConfigError, from_dict
+from hasrl_jax.config import Config, ConfigError, from_dict, shipped, to_dict
+from hasrl_jax.config_checks import check_number
 from hasrl_jax.envs.cpu_env import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 
 SETTLE_S = 3.0  # the speed error counts from this long after an episode's start or a new command
-PAPER_RATE = {"timestep_s": 0.0005, "steps_per_env_step": 50, "integrator": "Euler", "solver_iterations": 50}
+MAX_SECONDS = 3600.0
 
 
 class Episodes(NamedTuple):
@@ -26,6 +27,7 @@ class Episodes(NamedTuple):
     episode_length: np.ndarray  # [N] environment steps
     reached_cap: np.ndarray  # [N] bool: ended by the time limit, not by a fall
     seconds: np.ndarray  # [N] simulated time upright
+    diverged: np.ndarray  # [N] bool: ended by a failure of the simulation, whose step does not count
     measures: np.ndarray  # [T, N, M] the task's measures; NaN after an episode's end
 
 
@@ -52,22 +54,24 @@ def run_episodes(
     std = np.exp(numpy_policy.log_std(parameters, mirror))
     env_step_s = state.model_fields.get("timestep", task.model.opt.timestep) * task.steps_per_env_step
     total, length = np.zeros(episodes), np.zeros(episodes, np.int64)
-    reached_cap, running = np.zeros(episodes, bool), np.ones(episodes, bool)
-    measures = np.full((cap, episodes, len(task.measures)), np.nan)
-    for t in range(cap):
+    reached_cap, diverged, running = np.zeros(episodes, bool), np.zeros(episodes, bool), np.ones(episodes, bool)
+    measures = []
+    for _ in range(cap):
         inputs = numpy_policy.streams(state.observation, parameters, mirror)
         action, carry = numpy_policy.policy_step(parameters, inputs, carry, state.is_first, mirror)
         if not mean_action:
             action = action + std * rng.standard_normal(action.shape, np.float32)
         state, result = envs.step(state, action, rng)
-        measures[t, running] = result.measures[running]
-        total += np.where(running, result.reward, 0.0)
-        length += running
+        valid = running & ~result.diverged
+        measures.append(np.where(valid[:, None], result.measures, np.nan))
+        total += np.where(valid, result.reward, 0.0)
+        length += valid
         reached_cap |= running & result.truncated
+        diverged |= running & result.diverged
         running &= ~(result.terminated | result.truncated | result.diverged)
         if not running.any():
             break
-    return Episodes(total, length, reached_cap, length * env_step_s, measures[: t + 1])
+    return Episodes(total, length, reached_cap, length * env_step_s, diverged, np.stack(measures))
 
 
 def summarize(episodes: Episodes, task: Task) -> dict[str, Any]:
@@ -78,6 +82,7 @@ def summarize(episodes: Episodes, task: Task) -> dict[str, Any]:
         "episode_length": mean_interval(episodes.episode_length),
         "seconds_upright": mean_interval(episodes.seconds),
         "share_reaching_cap": share_interval(episodes.reached_cap),
+        "diverged_episodes": int(episodes.diverged.sum()),
     }
     if "forward_speed" in task.measures:
         summary |= _speeds(episodes, task)
@@ -132,12 +137,17 @@ def share_interval(hits: np.ndarray) -> dict[str, float]:
 
 
 def evaluate(arguments: list[str]) -> None:
-    """The command: loads a policy, plays, prints and writes the summary."""
+    """The command: loads a policy, plays, prints and writes the summary.
+
+    Raises:
+      ConfigError: an impossible argument; RunError, CheckpointError: no policy.
+    """
     from hasrl_jax.policies import load_policy_parameters
 
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m hasrl_jax.evaluate",
-        description="Play fixed-seed episodes. Any config field can be overridden: --cassie.randomize.enabled False",
+        description="Play fixed-seed episodes. Physics and cassie settings can be overridden: "
+        "--cassie.randomize.enabled False",
         allow_abbrev=False,
     )
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
@@ -149,14 +159,16 @@ def evaluate(arguments: list[str]) -> None:
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mean")
     parser.add_argument("--json", type=Path, help="write the statistics here")
     known, rest = parser.parse_known_args(arguments)
-    if known.episodes < 1:
-        raise ConfigError(f"--episodes: got {known.episodes}; expected at least 1")
-    if known.seed < 0:
-        raise ConfigError(f"--seed: got {known.seed}; expected 0 or more")
+    check_number("--episodes", "evaluate.episodes", known.episodes)
+    check_number("--seed", "seed", known.seed)
+    if not 0 < known.seconds <= MAX_SECONDS:
+        raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most {MAX_SECONDS:g}")
+    if known.json:
+        require_writable("--json", known.json)
     config, parameters = load_policy_parameters(known.run_dir, known.policy)
     if known.physics == "paper" and config.task == "cassie":
-        config = from_dict({"physics": PAPER_RATE}, config)
-    config = cli.override(config, rest, "evaluate")
+        config = from_dict({"physics": to_dict(shipped("paper").physics)}, config)
+    config = cli.override_for_policy(config, rest, "evaluate")
     env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
     config = from_dict({"collect": {"max_episode_steps": max(1, round(known.seconds / env_step_s))}}, config)
     task = make_task(config)

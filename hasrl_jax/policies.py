@@ -46,7 +46,7 @@ def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
     task = make_task(config)
     template = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
     loaded = checkpoint.load(run_dir / CHECKPOINTS_DIRECTORY, template)
-    return config, ppo.export_parameters(loaded.learner)
+    return config, ppo.export_parameters(loaded.learner, config.network.normalize_observations)
 
 
 def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
@@ -57,7 +57,7 @@ def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: its configuration cannot be read: {error}") from None
     task = make_task(config)
-    wanted = parameter_shapes(task.observation_size, task.action_size, config.network.hidden_size)
+    wanted = parameter_shapes(task.observation_size, task.action_size, config.network)
     for name, shape in wanted.items():
         found = parameters[name].shape if name in parameters else "missing"
         if found != shape:

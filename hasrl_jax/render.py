@@ -8,7 +8,6 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hasrl_jax import opengl
+from hasrl_jax.arguments import OneLineParser, require_writable
 
 if TYPE_CHECKING:
     from hasrl_jax.config import Config
@@ -157,13 +157,9 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     _check(known)
     config, parameters = load_policy_parameters(known.run_dir, known.policy)
     config = _config_to_film(config, known)
-    config = cli.override(config, rest, "render")
-    strip = known.strip or known.out.with_suffix(".png")
+    config = cli.override_for_policy(config, rest, "render")
+    strip = _strip(known)
     env = gymnasium_env.TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX)
-    for path in (known.out, strip):  # fail now, and not after minutes of rendering
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
     try:
         frames = max(1, round(known.seconds / env.task.env_step_s))
         push = Push(known.push, known.push_at)
@@ -184,8 +180,13 @@ def _config_to_film(config: "Config", known: argparse.Namespace) -> "Config":
     return fixed_command(from_dict(changes, config), known.forward, known.lateral)
 
 
+def _strip(known: argparse.Namespace) -> Path:
+    return known.strip or known.out.with_suffix(".png")
+
+
 def _check(known: argparse.Namespace) -> None:
     from hasrl_jax.config import ConfigError
+    from hasrl_jax.config_checks import check_number
 
     for name in ("width", "height"):
         value = getattr(known, name)
@@ -197,16 +198,17 @@ def _check(known: argparse.Namespace) -> None:
             raise ConfigError(f"--{name.replace('_', '-')}: got {value}; expected a finite number")
     if not 0 < known.seconds <= 3600:
         raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most 3600")
-    if known.seed < 0:
-        raise ConfigError(f"--seed: got {known.seed}; expected 0 or more")
-    if known.out.suffix.lower() != ".mp4":
-        raise ConfigError(f"--out: got {known.out}; expected a name that ends in .mp4")
+    check_number("--seed", "seed", known.seed)
+    for name, path, suffix in (("--out", known.out, ".mp4"), ("--strip", _strip(known), ".png")):
+        if path.suffix.lower() != suffix:
+            raise ConfigError(f"{name}: got {path}; expected a name that ends in {suffix}")
+        require_writable(name, path)  # fail now, and not after minutes of rendering
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m hasrl_jax.render",
-        description="Film a policy. Any config field can be overridden: --cassie.randomize.enabled True",
+        description="Film a policy. Physics and cassie settings can be overridden: --cassie.randomize.enabled True",
         allow_abbrev=False,
     )
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is filmed")

@@ -119,7 +119,9 @@ def _require_run(path: Path) -> None:
     if not path.is_dir():
         raise RunError(f"{path}: there is no such run directory")
     if not (path / CONFIG_FILE).is_file():
-        raise RunError(f"{path}: not a run directory, it has no {CONFIG_FILE}")
+        runs = [parent for parent in path.resolve().parents[:2] if (parent / CONFIG_FILE).is_file()]
+        hint = f"; did you mean {runs[0]}?" if runs else ""
+        raise RunError(f"{path}: not a run directory, it has no {CONFIG_FILE}{hint}")
 
 
 def _require_no_run(path: Path) -> None:

@@ -40,9 +40,9 @@ def train(config: Config, resume: bool = False) -> None:
     prepare_jax(config)
     task, mesh = make_task(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
+    update = ppo.make_update(config, *sizes, mesh)
     with open_run(config, resume) as run, stop_signal() as stop:
         learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
-        update = ppo.make_update(config, *sizes, mesh)
         progress, env_states = Progress(), []
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
@@ -55,6 +55,8 @@ def train(config: Config, resume: bool = False) -> None:
         ):
             announce(config, collector, task, run.path, progress)
             collector.load(env_states)
+            if not resume:
+                save(config, run.checkpoints, progress, learner, [])  # whatever happens now, --resume has a beginning
             while progress.env_steps < config.total_env_steps and not stop:
                 started = time.monotonic()
                 if not collector.busy:
@@ -72,6 +74,11 @@ def train(config: Config, resume: bool = False) -> None:
                 learner, result = update(learner, experience.trajectory)
                 record: Record = {"iteration": progress.iteration + 1, "env_steps": env_steps, **experience.record}
                 record |= {name: float(value) for name, value in result.items()}  # waits for the update to finish
+                if not record.pop("parameters_finite"):
+                    raise FloatingPointError(
+                        f"iteration {progress.iteration + 1}: the update gave parameters that are not finite, and nothing "
+                        "of it is saved; lower ppo.policy_learning_rate or ppo.value_learning_rate and use --resume"
+                    )
                 now = time.monotonic()
                 record |= {
                     "policy_lag": progress.iteration - experience.version,
@@ -95,7 +102,7 @@ def train(config: Config, resume: bool = False) -> None:
 def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:
     """Return and length of evaluation episodes with the mean action."""
     started = time.monotonic()
-    parameters = ppo.export_parameters(learner)
+    parameters = ppo.export_parameters(learner, config.network.normalize_observations)
     episodes = run_episodes(config, task, parameters, config.evaluate.episodes, seed=TEST_SEED)
     return {
         "episode_return_test": float(episodes.episode_return.mean()),
@@ -127,7 +134,7 @@ def announce(config: Config, collector: Collector, task: Task, run_dir: Path, pr
         1 / task.env_step_s,
     )
     after = f", continuing after iteration {progress.iteration}" if progress.iteration else ""
-    log.info("run directory %s%s; compiling the learner takes some seconds", run_dir, after)
+    log.info("run directory %s%s", run_dir, after)
 
 
 class Stop:
@@ -141,7 +148,7 @@ class Stop:
 
 @contextmanager
 def stop_signal() -> Iterator[Stop]:
-    """Turns the first Ctrl-C or SIGTERM into a request to stop after this iteration; the second acts at once."""
+    """Turns the first Ctrl-C, SIGTERM or SIGHUP into a request to stop after the iteration; the second acts at once."""
     stop = Stop()
 
     def request(number: int, frame: FrameType | None) -> None:
@@ -150,7 +157,10 @@ def stop_signal() -> Iterator[Stop]:
         stop.requested = True
         log.info("%s: finishing this iteration, then saving; once more stops at once", signal.Signals(number).name)
 
-    previous = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup has it ignored
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, request) for number in numbers}
     try:
         yield stop
     finally:

@@ -4,17 +4,20 @@ import argparse
 import importlib
 import json
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Protocol
 
 from hasrl_jax import cli
-from hasrl_jax.bench.report import describe_machine
+from hasrl_jax.bench.report import claim_file, describe_machine
 
 # name -> (module with the functions of `Bench`, one line for --help); modules load only when they are run
 BENCHES = {
     "collector": ("hasrl_jax.bench.collector", "env steps/s of the CPU pool, and its share of the physics limit"),
     "learner": ("hasrl_jax.bench.learner", "seconds per PPO update, compile time and recompiles"),
+    "mjx": ("hasrl_jax.bench.mjx", "physics and environment steps/s of MJX by number of environments"),
+    "parity": ("hasrl_jax.bench.parity", "how closely MJX follows C MuJoCo: observations, rewards, terminations"),
 }
 
 
@@ -26,7 +29,10 @@ class Bench(Protocol):
         ...
 
     def measure(self, arguments: argparse.Namespace) -> dict:
-        """Runs, and returns figures that JSON can hold; their names carry their units."""
+        """Runs, and returns figures that JSON can hold; their names carry their units.
+
+        The first to touch JAX, so it can make settings that must come before.
+        """
         ...
 
     def tables(self, figures: dict) -> str:
@@ -53,13 +59,13 @@ def run(arguments: argparse.Namespace) -> None:
     """Measures, prints and writes."""
     bench: Bench = importlib.import_module(BENCHES[arguments.name][0])  # type: ignore[assignment]
     if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.touch()  # a path that cannot be written fails before the work, not after it
-    machine = describe_machine()
+        claim_file(arguments.json)
+    load_average = os.getloadavg()[0]  # tells whether the machine was busy with other work
     figures = bench.measure(arguments)
+    machine = describe_machine() | {"load_average": load_average}
     print(bench.tables(figures))
     print(f"\n{machine['cores']} cores ({machine['cpu']}), load {machine['load_average']:.1f} at the start")
-    print(f"learner device: {machine['device']}")
+    print(f"JAX device: {machine['device']}")
     if arguments.json:
         report = {"bench": arguments.name, **machine, "figures": figures}
         arguments.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

@@ -1,6 +1,5 @@
 """What every benchmark reports beside its figures, and how it prints them."""
 
-import os
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -11,11 +10,11 @@ import jax
 
 from hasrl_jax.config import available_cores
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "flax", "optax", "numpy")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 
 
 def describe_machine() -> dict:
-    """Date, versions, device and cores; the load average tells whether the machine was busy with other work."""
+    """Date, versions, device and cores. Touches the devices, after which JAX takes no more settings."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
@@ -23,8 +22,13 @@ def describe_machine() -> dict:
         "device": ", ".join(sorted({device.device_kind for device in jax.devices()})),
         "cpu": _cpu_name(),
         "cores": available_cores(),
-        "load_average": os.getloadavg()[0],
     }
+
+
+def claim_file(path: Path) -> None:
+    """Makes an empty file, so that a path that cannot be written fails before the work and not after it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

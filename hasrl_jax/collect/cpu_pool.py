@@ -226,7 +226,9 @@ class CpuPool:
             code = worker.process.wait()
             return b"", f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
         if data.startswith(b'{"error"'):
-            return b"", f"raised\n{json.loads(data)['error']}"
+            error = json.loads(data)["error"].rstrip()
+            log.warning("worker %d (process %d) failed:\n%s", index, worker.process.pid, error)
+            return b"", f"raised {error.splitlines()[-1]}"
         return data, None
 
     def _silence(self) -> str:
@@ -235,7 +237,12 @@ class CpuPool:
     def _replace_silent(self, pending: set[int]) -> set[int]:
         """Replaces workers without a heartbeat; returns their indices."""
         limit = self.config.collect.worker_timeout_s
-        silent = {index for index in pending if time.monotonic() - self._block.heartbeat[index] > limit}
+        silent = {
+            index
+            for index in pending
+            # An answer that waits to be read says that it is alive, however long this process was held up.
+            if time.monotonic() - self._block.heartbeat[index] > limit and not self._workers[index].connection.poll(0)
+        }
         for index in silent:
             self._replace(index, self._silence())
         return silent

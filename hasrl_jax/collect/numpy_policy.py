@@ -6,14 +6,16 @@ the time and memory of importing JAX, and a batch of a few dozen states needs no
 
 import numpy as np
 
+from hasrl_jax.config import NetworkConfig
 from hasrl_jax.types import Mirror
 
 LAYERS = 2
 Parameters = dict[str, np.ndarray]
 
 
-def parameter_shapes(observation_size: int, action_size: int, hidden: int) -> dict[str, tuple[int, ...]]:
+def parameter_shapes(observation_size: int, action_size: int, network: NetworkConfig) -> dict[str, tuple[int, ...]]:
     """Names and shapes of every array that a worker needs, in broadcast order."""
+    hidden = network.hidden_size
     shapes: dict[str, tuple[int, ...]] = {}
     for layer, inputs in enumerate((observation_size, hidden)):
         shapes[f"policy/lstm_{layer}_input"] = (inputs, 4 * hidden)
@@ -25,16 +27,18 @@ def parameter_shapes(observation_size: int, action_size: int, hidden: int) -> di
     for layer, (inputs, outputs) in enumerate(((observation_size, hidden), (hidden, hidden), (hidden, 1))):
         shapes[f"value/dense_{layer}_kernel"] = (inputs, outputs)
         shapes[f"value/dense_{layer}_bias"] = (outputs,)
-    shapes["normalizer/mean"] = (observation_size,)
-    shapes["normalizer/std"] = (observation_size,)
+    if network.normalize_observations:
+        shapes["normalizer/mean"] = shapes["normalizer/std"] = (observation_size,)
     return shapes
 
 
 def streams(observation: np.ndarray, parameters: Parameters, mirror: Mirror | None) -> np.ndarray:
     """Normalised network inputs, [S, E, O]: the observation and, for a symmetric network, its mirror image."""
     inputs = [observation] if mirror is None else [observation, mirror.observation(observation)]
-    normalized = (np.stack(inputs) - parameters["normalizer/mean"]) / parameters["normalizer/std"]
-    return np.clip(normalized, -10, 10).astype(np.float32)
+    stacked = np.stack(inputs)
+    if "normalizer/mean" in parameters:
+        stacked = np.clip((stacked - parameters["normalizer/mean"]) / parameters["normalizer/std"], -10, 10)
+    return stacked.astype(np.float32)
 
 
 def policy_step(

@@ -28,8 +28,11 @@ class Plan(NamedTuple):
 def make_plan(config: Config) -> Plan:
     """Rounds the budget up so that every environment collects the same number of steps."""
     collect = config.collect
-    num_workers = collect.num_workers
-    num_envs = num_workers * collect.envs_per_worker
+    num_workers, envs_per_worker = collect.num_workers, collect.envs_per_worker
+    if collect.mode == "unrolls":  # on many cores, fewer environments each rather than a larger iteration
+        most = collect.env_steps_per_iteration // (num_workers * collect.unroll_length)
+        envs_per_worker = max(1, min(envs_per_worker, most))
+    num_envs = num_workers * envs_per_worker
     steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
     minibatch = config.ppo.minibatch_trajectories
     if collect.mode == "unrolls":
@@ -41,4 +44,4 @@ def make_plan(config: Config) -> Plan:
         rows = minibatch  # episodes vary in number: the batch grows by whole minibatches
     rows = -(-rows // minibatch) * minibatch
     width = config.network.hidden_size * (2 if config.network.symmetric else 1)
-    return Plan(num_workers, collect.envs_per_worker, steps_per_env, max_length, rows, (2, 2, width))
+    return Plan(num_workers, envs_per_worker, steps_per_env, max_length, rows, (2, 2, width))

@@ -14,7 +14,7 @@ import psutil
 
 from hasrl_jax.collect.numpy_policy import Parameters, parameter_shapes
 from hasrl_jax.collect.plan import Plan
-from hasrl_jax.config import Config
+from hasrl_jax.config import Config, NetworkConfig
 
 Specs = dict[str, tuple[tuple[int, ...], str]]  # name -> (shape, dtype)
 ALIGNMENT = 64  # bytes, a cache line
@@ -97,9 +97,9 @@ def slot_specs(
     }
 
 
-def parameter_specs(observation_size: int, action_size: int, hidden: int) -> Specs:
+def parameter_specs(observation_size: int, action_size: int, network: NetworkConfig) -> Specs:
     """One copy of the parameters that the workers act with."""
-    shapes = parameter_shapes(observation_size, action_size, hidden)
+    shapes = parameter_shapes(observation_size, action_size, network)
     return {name: (shape, "float32") for name, shape in shapes.items()}
 
 
@@ -138,5 +138,5 @@ def open_block(config: Config, plan: Plan, observation_size: int, action_size: i
     unrolls = config.collect.mode == "unrolls"
     num_segments = plan.steps_per_worker // (plan.max_length if unrolls else 1)
     slot = slot_specs(plan.steps_per_worker, num_segments, observation_size, action_size, plan.carry_shape)
-    parameters = parameter_specs(observation_size, action_size, config.network.hidden_size)
+    parameters = parameter_specs(observation_size, action_size, config.network)
     return Block(descriptor, plan.num_workers, parameters, slot)

@@ -161,27 +161,34 @@ class Actor:
         """Everything the environments carry, as an .npz archive; empty before the first collection."""
         if self.state is None:
             return b""
-        state = self.state
-        arrays = {name: getattr(state, name) for name in state._fields if name not in ("task", "model_fields")}
-        arrays |= {f"task/{name}": array for name, array in state.task._asdict().items()}
-        arrays |= {f"model/{name}": array for name, array in state.model_fields.items()}
         buffer = io.BytesIO()
-        np.savez(buffer, carry=self.carry, **arrays)
+        np.savez(buffer, carry=self.carry, **_flat(self.state))  # type: ignore[arg-type]
         return buffer.getvalue()
 
     def load(self, data: bytes) -> bool:
-        """Restores what `save` returned; False, and nothing changes, when that was nothing or for other sizes."""
-        arrays = dict(np.load(io.BytesIO(data), allow_pickle=False)) if data else {}
-        if not data or arrays["carry"].shape != self.carry.shape:
+        """Restores what `save` returned; False, and nothing changes, when that was nothing or of other settings."""
+        saved = dict(np.load(io.BytesIO(data), allow_pickle=False)) if data else {}
+        fresh = self.envs.reset(np.random.default_rng(0))
+        wanted = _flat(fresh) | {"carry": self.carry}
+        if {name: array.shape for name, array in saved.items()} != {
+            name: array.shape for name, array in wanted.items()
+        }:
+            if self.state is not None:
+                self.envs.restore(self.state)
             return False
-        self.carry = arrays.pop("carry")
-        rng = np.random.Generator(np.random.Philox(0))
-        template = self.task.reset(rng.random((1, self.task.reset_uniforms)), np)
-        task_state = type(template.state)(**{name: arrays.pop(f"task/{name}") for name in template.state._fields})
-        fields = {name: arrays.pop(f"model/{name}") for name in template.model_fields}
-        self.state = EnvState(task=task_state, model_fields=fields, **arrays)
+        self.carry = saved.pop("carry")
+        task_state = type(fresh.task)(**{name: saved.pop(f"task/{name}") for name in fresh.task._fields})
+        fields = {name: saved.pop(f"model/{name}") for name in fresh.model_fields}
+        self.state = EnvState(task=task_state, model_fields=fields, **saved)
         self.envs.restore(self.state)
         return True
+
+
+def _flat(state: EnvState) -> dict[str, np.ndarray]:
+    """The arrays of `state` by name."""
+    arrays = {name: getattr(state, name) for name in state._fields if name not in ("task", "model_fields")}
+    arrays |= {f"task/{name}": array for name, array in state.task._asdict().items()}
+    return arrays | {f"model/{name}": array for name, array in state.model_fields.items()}
 
 
 def serve(connection: Connection, descriptor: int) -> None:

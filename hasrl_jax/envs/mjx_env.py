@@ -97,7 +97,7 @@ class MjxEngine:
         """As `step`, but from given uniform numbers [task.step_uniforms] and without a reset at the end."""
         task = self.task
         with jax.default_matmul_precision("highest"):  # TF32 would cost the physics three digits
-            reading, overflow = self._simulate(state, task.control(state.task, action, jnp))
+            reading, overflow = self.simulate(state, task.control(state.task, action, jnp))
             outcome = task.step(state.task, action, reading, uniforms, jnp)
         finite = [_all_moderate(x) for x in (*reading, outcome.observation, outcome.reward_terms, outcome.measures)]
         diverged = ~jnp.all(jnp.stack(finite))
@@ -124,7 +124,7 @@ class MjxEngine:
         )
         return next_state, result
 
-    def _simulate(self, state: MjxEnvState, control: Array) -> tuple[Reading, Array]:
+    def simulate(self, state: MjxEnvState, control: Array) -> tuple[Reading, Array]:
         """The physics steps of one environment step under constant control [nu]; also the overflow flags [2]."""
         task, model = self.task, _with_fields(self.model, state.model_fields)
 

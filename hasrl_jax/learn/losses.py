@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hasrl_jax.config import PPOConfig
 from hasrl_jax.learn import distributions, networks, returns
+from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS
 from hasrl_jax.learn.networks import Parameters, Policy, Value
 from hasrl_jax.types import Trajectory
 
@@ -24,8 +25,47 @@ class Batch(NamedTuple):
     weight: jax.Array  # [B, T] bool, steps that the losses average over
 
 
+def prepare_batch(trajectory: Trajectory, ppo: PPOConfig) -> tuple[Batch, Metrics]:
+    """Blanks masked steps and adds advantages and targets, from the behaviour values, once per iteration.
+
+    Args:
+      trajectory: [B, T, ...]; fields may hold anything, even NaN, where the mask is False.
+      ppo: reads the advantage settings and `mask_padding`.
+
+    Returns:
+      (batch [B, T, ...], {"explained_variance"} of the behaviour values).
+
+    Source: paper II.E Eq. 2 and 3, III.A.
+    """
+    mask = trajectory.mask
+
+    def blank(field: jax.Array) -> jax.Array:
+        valid = mask.reshape(mask.shape + (1,) * (field.ndim - 2))
+        return jnp.where(valid, field, jnp.zeros_like(field))
+
+    per_step = {name: blank(field) for name, field in trajectory._asdict().items() if name not in PER_TRAJECTORY_FIELDS}
+    steps = trajectory._replace(**per_step)
+    advantage, target = returns.advantage_and_target(
+        steps.reward,
+        steps.value,
+        steps.terminated,
+        steps.truncated,
+        steps.bootstrap_value,
+        mask,
+        ppo.discount,
+        ppo.gae_lambda,
+        ppo.advantage,
+    )
+    unexplained = returns.masked_variance(target - steps.value, mask)
+    explained_variance = 1.0 - unexplained / jnp.maximum(returns.masked_variance(target, mask), 1e-8)
+    if ppo.standardize_advantages:
+        advantage = returns.masked_standardize(advantage, mask)
+    weight = mask if ppo.mask_padding else jnp.ones_like(mask)
+    return Batch(steps, advantage, jnp.where(mask, target, 0.0), weight), {"explained_variance": explained_variance}
+
+
 def policy_loss(
-    params: Parameters, policy: Policy, batch: Batch, mean: jax.Array, std: jax.Array, ppo: PPOConfig
+    params: Parameters, policy: Policy, batch: Batch, mean: jax.Array | None, std: jax.Array | None, ppo: PPOConfig
 ) -> tuple[jax.Array, Metrics]:
     """Clipped surrogate and entropy bonus.
 
@@ -68,7 +108,7 @@ def policy_loss(
 
 
 def value_loss(
-    params: Parameters, value: Value, batch: Batch, mean: jax.Array, std: jax.Array, ppo: PPOConfig
+    params: Parameters, value: Value, batch: Batch, mean: jax.Array | None, std: jax.Array | None, ppo: PPOConfig
 ) -> jax.Array:
     """c2 E_t[(V(s_t) - R_t)^2] / 2; arguments as in `policy_loss`. Source: paper II.E (critic loss)."""
     prediction = networks.values(value, params, batch.trajectory.observation, mean, std)

@@ -38,12 +38,10 @@ def check_mirror(mirror: Mirror, observation_size: int, action_size: int) -> Non
 
 
 def normalize_observation(observation: jax.Array, mean: jax.Array | None, std: jax.Array | None) -> jax.Array:
-    """(observation - mean) / std, clipped to +-OBSERVATION_CLIP; None stands for mean 0 and deviation 1."""
-    if mean is not None:
-        observation = observation - mean
-    if std is not None:
-        observation = observation / std
-    return jnp.clip(observation, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+    """(observation - mean) / std, clipped to +-OBSERVATION_CLIP; None for both leaves the observation as it is."""
+    if mean is None or std is None:
+        return observation
+    return jnp.clip((observation - mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
 def zero_carry(batch: int, hidden_size: int, symmetric: bool = False) -> np.ndarray:
@@ -126,8 +124,8 @@ class Policy(nn.Module):
           observation: [N, O] single states, or [B, T, O] sequences; raw.
           carry: [N or B, L, 2, W] state before the first step (see `zero_carry`); None for zeros.
           is_first: [N] or [B, T] bool, the carry is zeroed before these steps; None for no resets.
-          observation_mean: [O] normaliser mean; None for 0.
-          observation_std: [O] normaliser deviation; None for 1.
+          observation_mean: [O] normaliser mean; None does not normalise.
+          observation_std: [O] normaliser deviation; None does not normalise.
 
         Returns:
           (mean action [N, A] or [B, T, A], carry after the last step, shaped as `carry`).
@@ -214,7 +212,9 @@ def log_std(policy: Policy, params: Parameters) -> jax.Array:
     return cast(jax.Array, policy.apply({"params": params}, method=Policy.log_std))
 
 
-def values(value: Value, params: Parameters, observation: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
+def values(
+    value: Value, params: Parameters, observation: jax.Array, mean: jax.Array | None, std: jax.Array | None
+) -> jax.Array:
     """V(s) of raw observations [..., O] under the normaliser's mean and deviation [O]: [...]."""
     return cast(jax.Array, value.apply({"params": params}, observation, mean, std))
 

@@ -57,11 +57,11 @@ def update(normalizer: Normalizer, observation: jax.Array, mask: jax.Array) -> N
     )
 
 
-def mean_std(normalizer: Normalizer, enabled: bool = True) -> tuple[jax.Array, jax.Array]:
-    """(mean [O], standard deviation [O]); 0 and 1 when disabled or before any observation."""
-    zeros, ones = jnp.zeros_like(normalizer.mean), jnp.ones_like(normalizer.mean)
+def mean_std(normalizer: Normalizer, enabled: bool = True) -> tuple[jax.Array | None, jax.Array | None]:
+    """(mean [O], standard deviation [O]); 0 and 1 before any observation, None for both when disabled."""
     if not enabled:
-        return zeros, ones
+        return None, None
+    zeros, ones = jnp.zeros_like(normalizer.mean), jnp.ones_like(normalizer.mean)
     std = jnp.maximum(jnp.sqrt(normalizer.m2 / jnp.maximum(normalizer.count, 1.0)), MINIMUM_STD)
     seen = normalizer.count > 0
     return jnp.where(seen, normalizer.mean, zeros), jnp.where(seen, std, ones)

@@ -4,6 +4,7 @@ Separate losses, optimisers and gradient clips for policy and value (paper II.E)
 one scan. Parameters are replicated and trajectories split over the mesh axis `data`; one CPU runs the same program.
 """
 
+import logging
 from typing import Any, NamedTuple
 
 import jax
@@ -12,14 +13,16 @@ import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hasrl_jax.config import Config, PPOConfig
-from hasrl_jax.learn import networks, normalize, returns
-from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS, minibatch_indices
-from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, value_loss
+from hasrl_jax.config import Config, ConfigError, PPOConfig
+from hasrl_jax.learn import networks, normalize
+from hasrl_jax.learn.batching import minibatch_indices
+from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, prepare_batch, value_loss
 from hasrl_jax.learn.networks import Policy, Value, make_networks
 from hasrl_jax.types import Mirror, Trajectory
 
+log = logging.getLogger("hasrl_jax")
 Trained = tuple[Parameters, Any]  # parameters and their optimiser state
+Statistics = tuple[jax.Array | None, jax.Array | None]  # mean and deviation of observations, [O] each
 
 _LARGEST_INT32 = 2**31 - 1
 _POLICY_METRICS = (
@@ -95,16 +98,17 @@ def init_learner(
     return jax.jit(create)(key)  # one program starts sooner than its operations one by one
 
 
-def export_parameters(state: LearnerState) -> dict[str, np.ndarray]:
+def export_parameters(state: LearnerState, normalize_observations: bool = True) -> dict[str, np.ndarray]:
     """What a collector needs to act, as float32 NumPy arrays that it owns.
 
-    Names: "policy/<name>" and "value/<name>" with the parameter names of `Policy` and `Value`, "normalizer/mean" and
-    "normalizer/std" [O]. A disabled normaliser never sees data and so exports mean 0 and deviation 1.
+    Names: "policy/<name>" and "value/<name>" with the parameter names of `Policy` and `Value`, and, when observations
+    are normalised, "normalizer/mean" and "normalizer/std" [O].
     """
-    mean, std = normalize.mean_std(state.normalizer)
+    mean, std = normalize.mean_std(state.normalizer, normalize_observations)
     flat = {f"policy/{name}": array for name, array in state.policy_params.items()}
     flat |= {f"value/{name}": array for name, array in state.value_params.items()}
-    flat |= {"normalizer/mean": mean, "normalizer/std": std}
+    if mean is not None and std is not None:
+        flat |= {"normalizer/mean": mean, "normalizer/std": std}
     return {name: np.array(array, np.float32) for name, array in jax.device_get(flat).items()}
 
 
@@ -157,6 +161,7 @@ class Update:
     def _iteration(self, state: LearnerState, trajectory: Trajectory) -> tuple[LearnerState, Metrics]:
         """Advantages once, then all epochs and minibatches, then the normaliser."""
         self.trace_count += 1
+        log.info("compiling the update for %d trajectories of %d steps", *trajectory.reward.shape)
         config, ppo = self.config, self.config.ppo
         batch, metrics = prepare_batch(trajectory, ppo)
         statistics = normalize.mean_std(state.normalizer, config.network.normalize_observations)
@@ -181,6 +186,8 @@ class Update:
         (policy, value, _), history = jax.lax.scan(minibatch_step, (policy, value, jnp.asarray(True)), indices)
         log_std = networks.log_std(self.policy, policy[0])
         metrics |= _summarize(*history)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((policy, value))]
+        metrics["parameters_finite"] = jnp.all(jnp.stack(finite)).astype(jnp.float32)
         metrics |= {"learning_rate": scale * ppo.policy_learning_rate, "std_mean": jnp.mean(jnp.exp(log_std))}
         steps = batch.trajectory
         normalizer = state.normalizer
@@ -200,7 +207,7 @@ class Update:
         return new_state, metrics
 
     def _update_policy(
-        self, policy: Trained, batch: Batch, statistics: tuple[jax.Array, jax.Array], scale: jax.Array
+        self, policy: Trained, batch: Batch, statistics: Statistics, scale: jax.Array
     ) -> tuple[Trained, jax.Array, Metrics]:
         """One policy step, undone when the policy has already moved too far: (policy, still active, metrics)."""
         ppo = self.config.ppo
@@ -213,7 +220,7 @@ class Update:
         return policy, active, metrics
 
     def _update_value(
-        self, value: Trained, batch: Batch, statistics: tuple[jax.Array, jax.Array], scale: jax.Array
+        self, value: Trained, batch: Batch, statistics: Statistics, scale: jax.Array
     ) -> tuple[Trained, Metrics]:
         ppo = self.config.ppo
         loss, gradient = jax.value_and_grad(value_loss)(value[0], self.value, batch, *statistics, ppo)
@@ -230,48 +237,16 @@ def make_update(config: Config, observation_size: int, action_size: int, mirror:
     """The update of a configuration; arguments as in `init_learner`, `mesh` from `make_mesh`.
 
     Raises:
+      ConfigError: the devices cannot share a minibatch evenly.
       ValueError: a symmetric network without a (valid) mirror.
     """
+    minibatch, devices = config.ppo.minibatch_trajectories, mesh.size
+    if minibatch % devices:
+        works = -(-minibatch // devices) * devices
+        raise ConfigError(
+            f"ppo.minibatch_trajectories: {minibatch} is not a multiple of the {devices} devices; {works} is"
+        )
     return Update(config, *make_networks(config.network, observation_size, action_size, mirror), mesh)
-
-
-def prepare_batch(trajectory: Trajectory, ppo: PPOConfig) -> tuple[Batch, Metrics]:
-    """Blanks masked steps and adds advantages and targets, from the behaviour values, once per iteration.
-
-    Args:
-      trajectory: [B, T, ...]; fields may hold anything, even NaN, where the mask is False.
-      ppo: reads the advantage settings and `mask_padding`.
-
-    Returns:
-      (batch [B, T, ...], {"explained_variance"} of the behaviour values).
-
-    Source: paper II.E Eq. 2 and 3, III.A.
-    """
-    mask = trajectory.mask
-
-    def blank(field: jax.Array) -> jax.Array:
-        valid = mask.reshape(mask.shape + (1,) * (field.ndim - 2))
-        return jnp.where(valid, field, jnp.zeros_like(field))
-
-    per_step = {name: blank(field) for name, field in trajectory._asdict().items() if name not in PER_TRAJECTORY_FIELDS}
-    steps = trajectory._replace(**per_step)
-    advantage, target = returns.advantage_and_target(
-        steps.reward,
-        steps.value,
-        steps.terminated,
-        steps.truncated,
-        steps.bootstrap_value,
-        mask,
-        ppo.discount,
-        ppo.gae_lambda,
-        ppo.advantage,
-    )
-    unexplained = returns.masked_variance(target - steps.value, mask)
-    explained_variance = 1.0 - unexplained / jnp.maximum(returns.masked_variance(target, mask), 1e-8)
-    if ppo.standardize_advantages:
-        advantage = returns.masked_standardize(advantage, mask)
-    weight = mask if ppo.mask_padding else jnp.ones_like(mask)
-    return Batch(steps, advantage, jnp.where(mask, target, 0.0), weight), {"explained_variance": explained_variance}
 
 
 def _skip_policy(policy: Trained, *_: Any) -> tuple[Trained, jax.Array, Metrics]:

@@ -39,7 +39,7 @@ def make_parameters() -> Callable[[Config], dict[str, np.ndarray]]:
         task = make_task(config)
         rng = np.random.default_rng(2)
         parameters = {}
-        shapes = parameter_shapes(task.observation_size, task.action_size, config.network.hidden_size)
+        shapes = parameter_shapes(task.observation_size, task.action_size, config.network)
         for name, shape in shapes.items():
             spread = 0.3 if len(shape) == 1 else 1 / np.sqrt(shape[0])
             parameters[name] = spread * rng.standard_normal(shape, np.float32)

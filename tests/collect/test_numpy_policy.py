@@ -62,4 +62,4 @@ def test_parameter_shapes_are_those_of_the_learner(make_config):
     shapes = {f"policy/{name}": array.shape for name, array in learner.policy_params.items()}
     shapes |= {f"value/{name}": array.shape for name, array in learner.value_params.items()}
     shapes |= {"normalizer/mean": (50,), "normalizer/std": (50,)}
-    assert numpy_policy.parameter_shapes(50, 10, 16) == shapes
+    assert numpy_policy.parameter_shapes(50, 10, make_config("cassie").network) == shapes

@@ -1,0 +1,34 @@
+"""Command-line arguments of the programs: complaints on one line, and outputs checked before the work."""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import NoReturn
+
+from hasrl_jax.config import ConfigError
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """An argument parser whose complaint is one line on stderr, without the usage; exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"error: {message.removeprefix('argument ')}\n")
+
+
+def require_writable(option: str, path: Path) -> None:
+    """Proves that the file can be written, and leaves it as it is.
+
+    Raises:
+      ConfigError: there is no such folder, or nothing can be written there.
+    """
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option}: got {path}; expected a file in a folder that exists, and {path.parent} does not")
+    try:
+        if path.exists():
+            with open(path, "ab"):
+                pass
+        else:
+            with tempfile.TemporaryFile(dir=path.parent):
+                pass
+    except OSError as error:
+        raise ConfigError(f"{option}: {path} cannot be written ({error.strerror})") from None
