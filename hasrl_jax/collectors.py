@@ -118,7 +118,8 @@ class MjxExperience:
         self.normalizes, self.reward_terms = config.network.normalize_observations, task.reward_terms
         self.busy, self._version, self._started = False, 0, 0.0
         self._pending: Any = None  # between `start` and `finish`
-        self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {self.plan.env_steps} environment steps per iteration"
+        steps = f"{self.plan.env_steps} environment steps per iteration"
+        self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {steps}"
 
     def __enter__(self) -> "MjxExperience":
         return self

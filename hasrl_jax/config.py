@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 import yaml
 
+from hasrl_jax import strict_yaml
+
 
 def available_cores() -> int:
     """Cores this process may run on."""
@@ -260,18 +262,6 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, where plain YAML lets the last one win."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen and isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands twice", key.start_mark)
-            seen.add(key.value if isinstance(key, yaml.ScalarNode) else id(key))
-        return super().construct_mapping(node, deep)
-
-
 def load_yaml(path: str | Path) -> Config:
     """Reads a YAML file over the defaults.
 
@@ -283,9 +273,9 @@ def load_yaml(path: str | Path) -> Config:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--config {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     try:
-        values = yaml.load(text, _StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or a number that cannot be
-        raise ConfigError(f"--config {path}: not valid YAML ({' '.join(str(error).split())})") from None
+        values = strict_yaml.parse(text)
+    except ValueError as error:
+        raise ConfigError(f"--config {path}: {error}") from None
     return from_dict({} if values is None else values, where=Path(path).name)
 
 

@@ -13,10 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-import yaml
 
 from hasrl_jax import config as config_module
-from hasrl_jax import config_checks
+from hasrl_jax import config_checks, strict_yaml
 from hasrl_jax.config import Config, ConfigError
 
 CONFIG_FILE = "config.yaml"
@@ -78,8 +77,8 @@ def load_run_config(run_dir: Path) -> Config:
     path = run_dir / CONFIG_FILE
     try:
         text = path.read_text(encoding="utf-8")
-        values = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        values = strict_yaml.parse(text)
+    except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be read: {_reason(error)}") from None
     # A file that was cut short is often still valid YAML; defaults must not quietly take the place of what is missing.
     missing = [f.name for f in dataclasses.fields(Config) if not isinstance(values, dict) or f.name not in values]

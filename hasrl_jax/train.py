@@ -76,8 +76,8 @@ def train(config: Config, resume: bool = False) -> None:
                 record |= {name: float(value) for name, value in result.items()}  # waits for the update to finish
                 if not record.pop("parameters_finite"):
                     raise FloatingPointError(
-                        f"iteration {progress.iteration + 1}: the update gave parameters that are not finite, and nothing "
-                        "of it is saved; lower ppo.policy_learning_rate or ppo.value_learning_rate and use --resume"
+                        f"iteration {progress.iteration + 1}: the update gave parameters that are not finite, and "
+                        "nothing of it is saved; use --resume with a lower ppo.policy_learning_rate"
                     )
                 now = time.monotonic()
                 record |= {

@@ -45,7 +45,7 @@ def _moment(**changes: object) -> render.Moment:
 def test_writes_a_film_and_a_strip(policy: Path, tmp_path: Path) -> None:
     if _backend() is None:
         pytest.skip(opengl.MISSING)
-    out = tmp_path / "films" / "random.mp4"
+    out = tmp_path / "random.mp4"
     arguments = ["--out", str(out), "--seconds", "0.25", "--width", "160", "--height", "120", "--forward", "0.5"]
     command = [sys.executable, "-m", "hasrl_jax.render", "--policy", str(policy), "--push", "100", "--push-at", "0"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120)
