@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-
 from hasrl_jax import config as config_module
 from hasrl_jax import config_checks, strict_yaml
 from hasrl_jax.config import Config, ConfigError
