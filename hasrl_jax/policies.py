@@ -14,6 +14,8 @@ from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 from hasrl_jax.run_directory import CHECKPOINTS_DIRECTORY, load_run_config
 
+RELEASED = Path(__file__).parent / "released" / "cassie_walk.npz"
+
 
 def load_policy_parameters(
     run_dir: str | Path | None, policy: str | Path | None
@@ -22,7 +24,8 @@ def load_policy_parameters(
 
     Args:
       run_dir: a run directory, whose newest whole checkpoint is taken; or None.
-      policy: a file of `checkpoint.save_policy` with its configuration under `config`; or None.
+      policy: a file of `checkpoint.save_policy` with its configuration under `config`, or "released" for the policy
+        that comes with the package; or None.
 
     Raises:
       ConfigError: not exactly one of the two is given.
@@ -33,7 +36,7 @@ def load_policy_parameters(
     if run_dir is not None:
         return _from_run(Path(run_dir))
     assert policy is not None
-    return _from_file(Path(policy))
+    return _from_file(RELEASED if policy == "released" else Path(policy))
 
 
 def policy_metadata(config: Config) -> dict[str, object]:
