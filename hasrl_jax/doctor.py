@@ -76,10 +76,10 @@ def check_shared_memory() -> Iterator[Check]:
     """Reserves what a default Cassie run shares with its workers."""
     from hasrl_jax.collect import shared_memory
     from hasrl_jax.collect.plan import make_plan
-    from hasrl_jax.config import Config
+    from hasrl_jax.config import shipped
     from hasrl_jax.envs.registry import make_task
 
-    config = Config()
+    config = shipped("cassie_walk")
     task = make_task(config)
     block = shared_memory.open_block(config, make_plan(config), task.observation_size, task.action_size)
     size = os.fstat(block.descriptor).st_size

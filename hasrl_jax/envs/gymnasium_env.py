@@ -17,7 +17,7 @@ from hasrl_jax.config import Config, ConfigError
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
-from hasrl_jax.envs.registry import TASKS, make_task
+from hasrl_jax.envs.registry import RECIPES, TASKS, make_task
 from hasrl_jax.envs.task import Task
 
 register()  # so that "hasrl_jax.envs.gymnasium_env:hasrl_jax/Cassie-v0" also names an environment
@@ -28,7 +28,7 @@ def make(task: str = "cassie", config: Config | None = None, **arguments: Any) -
 
     Args:
       task: a name from `registry.TASKS`; takes the place of `config.task`.
-      config: default `Config()`.
+      config: default: the task's training configuration, `registry.RECIPES`.
       **arguments: further arguments of `TaskEnv`.
 
     Raises:
@@ -36,7 +36,8 @@ def make(task: str = "cassie", config: Config | None = None, **arguments: Any) -
     """
     if task not in TASKS:
         raise ConfigError(f"task: got {task!r}; expected one of {', '.join(TASKS)}")
-    return TaskEnv(config_module.from_dict({"task": task}, config), **arguments)
+    base = config_module.shipped(RECIPES[task]) if config is None else config
+    return TaskEnv(config_module.from_dict({"task": task}, base), **arguments)
 
 
 def fixed_command(config: Config, forward: float | None = None, lateral: float | None = None) -> Config:
@@ -61,7 +62,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     is truncated with reward 0, and its last valid observation is returned again.
 
     Args:
-      config: default `Config()`; reads `task`, `physics`, `cassie` and `collect.max_episode_steps`.
+      config: default `configs/cassie_walk.yaml`; reads `task`, `physics`, `cassie` and `collect.max_episode_steps`.
       render_mode: None or "rgb_array".
       width, height: of rendered frames, pixels.
       camera: name of a camera of the model.
@@ -82,7 +83,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         camera: str = "track",
         shadow_px: int | None = None,
     ):
-        self.config = Config() if config is None else config
+        self.config = config_module.shipped("cassie_walk") if config is None else config
         config_checks.check(self.config)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode: got {render_mode!r}; expected None or 'rgb_array'")

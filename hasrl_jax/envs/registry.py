@@ -7,6 +7,7 @@ from hasrl_jax.envs import cartpole, cassie
 from hasrl_jax.envs.task import Task
 
 TASKS: dict[str, Callable[[Config], Task]] = {"cassie": cassie.make, "cartpole": cartpole.make}
+RECIPES = {"cassie": "cassie_walk", "cartpole": "cartpole"}  # the file in configs/ that trains each task
 
 
 def make_task(config: Config) -> Task:

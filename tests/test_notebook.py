@@ -1,0 +1,73 @@
+"""The notebook runs from top to bottom, on a budget of seconds."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+nbclient = pytest.importorskip("nbclient")
+nbformat = pytest.importorskip("nbformat")
+pytest.importorskip("ipykernel")
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOK = ROOT / "notebooks" / "cassie_colab.ipynb"
+TINY = """
+task: cartpole
+physics: {timestep_s: 0.005, steps_per_env_step: 5, integrator: Euler}
+network: {hidden_size: 8, initial_log_std: -1.0}
+collect: {num_workers: 1, envs_per_worker: 4, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
+ppo: {epochs: 1, minibatch_trajectories: 4}
+evaluate: {every_iterations: 2, episodes: 2}
+"""
+
+
+def test_outputs_are_not_committed() -> None:
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in cells)
+    assert NOTEBOOK.stat().st_size < 20_000
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    settings = {
+        "TOTAL_ENV_STEPS": "256",
+        "CONFIG": str(tmp_path / "tiny.yaml"),
+        "RUN_DIR": str(tmp_path / "run"),
+        "OVERRIDES": "--seed 3 --ppo.clip 0.1",
+        "EPISODES": "2",
+        "FILM_SECONDS": "0.2",
+        "XLA_FLAGS": "",  # one device, as a user has
+        "IPYTHONDIR": str(tmp_path / "ipython"),
+    }
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    # Opened from its own folder, as Jupyter does.
+    resources = {"metadata": {"path": str(NOTEBOOK.parent)}}
+    nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3", resources=resources).execute()
+
+    assert "--backend=cpu_pool" in printed(notebook, "devices")
+    assert "iteration 2 | 256 env steps" in printed(notebook, "train")
+    assert "image/png" in shown(notebook, "plot")
+    assert "episode_return" in printed(notebook, "evaluate")
+    if "No film" not in printed(notebook, "film"):
+        assert (tmp_path / "run" / "film.mp4").stat().st_size > 1000
+        assert "text/html" in shown(notebook, "film")
+    else:
+        assert "apt-get install" in printed(notebook, "film")
+
+
+def outputs(notebook: Any, name: str) -> list[Any]:
+    """What the cell of this id gave."""
+    return next(cell for cell in notebook.cells if cell.id == name).outputs
+
+
+def printed(notebook: Any, name: str) -> str:
+    return "".join(output.text for output in outputs(notebook, name) if output.output_type == "stream")
+
+
+def shown(notebook: Any, name: str) -> set[str]:
+    """Kinds of media that the cell displayed."""
+    return {kind for output in outputs(notebook, name) for kind in output.get("data", ())}
