@@ -17,7 +17,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from hasrl_jax.bench.mjx_plot import plot
@@ -54,10 +53,10 @@ def measure(arguments: argparse.Namespace) -> dict:
     Raises:
       ConfigError: an impossible argument; MemoryError: not even the smallest number fits.
     """
-    for name in ("unroll_length", "minibatches", "rounds", "num_envs"):
-        smallest = np.min(getattr(arguments, name) or 1)
-        if smallest < 1:
-            raise ConfigError(f"--{name.replace('_', '-')}: got {smallest}; expected at least 1")
+    counts = {name: [getattr(arguments, name)] for name in ("unroll_length", "minibatches", "rounds")}
+    for name, values in (counts | {"num_envs": arguments.num_envs or [1]}).items():
+        if min(values) < 1:
+            raise ConfigError(f"--{name.replace('_', '-')}: got {min(values)}; expected at least 1")
     base = load_yaml(arguments.config)
     base = replace(base, backend="mjx", compilation_cache=False)  # compilation is measured
     if arguments.impl:
@@ -67,7 +66,9 @@ def measure(arguments: argparse.Namespace) -> dict:
         claim_file(arguments.plot)
     prepare_jax(base)
     if jax.default_backend() == "cpu":
-        log.warning("bench mjx is meant for an accelerator; on a CPU it runs small and its figures say little")
+        log.warning(
+            "bench mjx is made for accelerators; on a CPU it runs small, for minutes, and its figures say little"
+        )
     cells = list(_cells(arguments, base))
     figures = {
         "task": base.task,
@@ -90,7 +91,7 @@ def measure(arguments: argparse.Namespace) -> dict:
 def _cells(arguments: argparse.Namespace, base: Config) -> Iterator[dict]:
     """One measurement after the other; what no longer fits ends them."""
     mesh = ppo.make_mesh()
-    for index, num_envs in enumerate(_numbers(arguments.num_envs)):
+    for index, num_envs in enumerate(numbers(arguments.num_envs)):
         config = make_config(base, num_envs, arguments.unroll_length, arguments.minibatches, mesh.size)
         try:
             cell = measure_cell(config, mesh, arguments.rounds)
@@ -105,7 +106,7 @@ def _cells(arguments: argparse.Namespace, base: Config) -> Iterator[dict]:
         yield cell
 
 
-def _numbers(chosen: list[int] | None) -> Iterable[int]:
+def numbers(chosen: list[int] | None) -> Iterable[int]:
     """Ascending, because the peak of the memory is that of the whole process."""
     if chosen:
         return sorted(set(chosen))

@@ -16,7 +16,6 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from hasrl_jax import config as config_module
@@ -237,7 +236,6 @@ def _die_with_parent(parent: int) -> None:
 def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # they reach the whole group; the pool decides what to do
         signal.signal(number, signal.SIG_IGN)
-    mujoco.set_mju_user_warning(lambda text: None)  # divergence is counted, not written to a log file
     connection = Connection(int(sys.argv[1]))
     try:
         serve(connection, int(sys.argv[2]))

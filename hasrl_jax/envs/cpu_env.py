@@ -53,6 +53,8 @@ class CpuEnvs:
     """
 
     def __init__(self, task: Task, num_envs: int, max_episode_steps: int):
+        # `step` reports a diverged simulation; MuJoCo would also write it to a file in the working directory.
+        mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
         self.max_episode_steps = max_episode_steps
         self.num_envs = num_envs
