@@ -37,7 +37,10 @@ class Experience(NamedTuple):
 
 
 class Collector(Protocol):
-    """What the training loop asks of a collector; a context manager that frees everything on exit."""
+    """What the training loop asks of a collector.
+
+    Making one only checks the configuration; entering its context starts what collects, leaving it frees everything.
+    """
 
     description: str  # one line for the start of a run
 
@@ -71,14 +74,15 @@ class CpuExperience:
     """A `CpuPool` whose buffers come out as padded trajectories."""
 
     def __init__(self, config: Config, task: Task):
-        self.plan, self.normalizes = make_plan(config), config.network.normalize_observations
-        self.pool = CpuPool(config, self.plan, task)
+        self.config, self.task, self.plan = config, task, make_plan(config)
+        self.normalizes = config.network.normalize_observations
         self.description = (
             f"{self.plan.num_workers} workers x {self.plan.envs_per_worker} environments, "
             f"{self.plan.env_steps} environment steps per iteration"
         )
 
     def __enter__(self) -> "CpuExperience":
+        self.pool = CpuPool(self.config, self.plan, self.task)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -114,7 +118,7 @@ class MjxExperience:
         engine = make_engine(task, settings.impl, cap, settings.num_envs // mesh.size, *limits)
         networks = make_networks(config.network, task.observation_size, task.action_size, task.mirror)
         self.collector = MjxCollector(self.plan, engine, *networks, mesh)
-        self.state = self.collector.init(config.seed)
+        self.seed = config.seed
         self.normalizes, self.reward_terms = config.network.normalize_observations, task.reward_terms
         self.busy, self._version, self._started = False, 0, 0.0
         self._pending: Any = None  # between `start` and `finish`
@@ -122,6 +126,7 @@ class MjxExperience:
         self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {steps}"
 
     def __enter__(self) -> "MjxExperience":
+        self.state = self.collector.init(self.seed)
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -40,7 +40,7 @@ def train(config: Config, resume: bool = False) -> None:
     prepare_jax(config)
     task, mesh = make_task(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
-    update = ppo.make_update(config, *sizes, mesh)
+    update, collector = ppo.make_update(config, *sizes, mesh), make_collector(config, task, mesh)
     with open_run(config, resume) as run, stop_signal() as stop:
         learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
         progress, env_states = Progress(), []
@@ -49,7 +49,7 @@ def train(config: Config, resume: bool = False) -> None:
             learner, progress, env_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
             write_config(run.path, config)  # some settings may differ from now on
         with (
-            make_collector(config, task, mesh) as collector,
+            collector,
             MetricsWriter(run.path, progress.iteration) as writer,
             ProgressPrinter(config.total_env_steps, progress.env_steps) as printer,
         ):

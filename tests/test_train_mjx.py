@@ -136,7 +136,7 @@ def test_a_policy_goes_on_in_the_other_mode(first: str, second: str, tiny: Path,
         (["--mjx.impl", "warp"], ["mjx.impl", "warp", "jax"]),
         (["--ppo.minibatch-trajectories", "12"], ["ppo.minibatch_trajectories", "8 devices"]),
     ],
-    ids=lambda value: value[0].lstrip("-") if isinstance(value, list) and value[0].startswith("-") else "",
+    ids=["solver", "devices", "none", "mode", "warp", "minibatch"],
 )
 def test_bad_input_is_one_line_that_names_the_setting(
     arguments: list[str], named: list[str], tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture

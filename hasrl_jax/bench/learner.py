@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 from hasrl_jax.bench.report import format_table
-from hasrl_jax.config import Config
+from hasrl_jax.config import Config, shipped
+from hasrl_jax.envs import cassie
 from hasrl_jax.learn import ppo
+from hasrl_jax.learn.networks import zero_carry
 from hasrl_jax.types import Trajectory
-
-OBSERVATION_SIZE, ACTION_SIZE = 50, 10  # of Cassie
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,14 +31,15 @@ def measure(arguments: argparse.Namespace) -> dict:
 def sizes(name: str) -> tuple[Config, int, int]:
     """Configuration, trajectories and steps per trajectory of one update.
 
-    `paper` is 100 trajectories of 100 steps in one minibatch, hidden 256, 10 epochs. Policy steps are never skipped,
-    so that every update does the same work.
+    `default` is `configs/cassie_walk.yaml`; `paper` is 100 trajectories of 100 steps in one minibatch, hidden 256,
+    10 epochs. Policy steps are never skipped, so that every update does the same work.
     """
-    config = Config()
-    collect = config.collect
     if name == "default":
+        config = shipped("cassie_walk")
+        collect = config.collect
         rows = collect.env_steps_per_iteration // collect.unroll_length
         return replace(config, ppo=replace(config.ppo, max_kl=0.0)), rows, collect.unroll_length
+    config = Config()
     network = replace(config.network, hidden_size=256, normalize_observations=False)
     settings = replace(config.ppo, epochs=10, minibatch_trajectories=100, max_kl=0.0)
     return replace(config, network=network, ppo=settings), 100, 100
@@ -46,7 +47,7 @@ def sizes(name: str) -> tuple[Config, int, int]:
 
 def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
     """Compiles, warms up, and times single updates on the same random trajectories."""
-    shapes = (OBSERVATION_SIZE, ACTION_SIZE, None)
+    shapes = (cassie.OBSERVATION_SIZE, cassie.ACTION_SIZE, cassie.mirror())
     learner = ppo.init_learner(config, *shapes, jax.random.key(config.seed))
     update = ppo.make_update(config, *shapes, ppo.make_mesh())
     trajectory = random_trajectory(config, rows, steps)
@@ -81,10 +82,10 @@ def random_trajectory(config: Config, rows: int, steps: int) -> Trajectory:
 
     first, last = np.zeros((2, rows, steps), bool)
     first[:, 0], last[:, -1] = True, True
-    action = noise(steps, ACTION_SIZE)
+    action = noise(steps, cassie.ACTION_SIZE)
     log_prob = -0.5 * np.sum(action**2 + np.log(2 * np.pi), axis=-1, dtype=np.float32)
     return Trajectory(
-        observation=noise(steps, OBSERVATION_SIZE),
+        observation=noise(steps, cassie.OBSERVATION_SIZE),
         action=action,
         log_prob=log_prob.astype(np.float32),
         value=noise(steps),
@@ -94,7 +95,7 @@ def random_trajectory(config: Config, rows: int, steps: int) -> Trajectory:
         truncated=last,
         bootstrap_value=noise(steps) * last,
         mask=np.ones((rows, steps), bool),
-        initial_carry=np.zeros((rows, 2, 2, config.network.hidden_size), np.float32),
+        initial_carry=zero_carry(rows, config.network.hidden_size, config.network.symmetric),
         policy_version=np.zeros(rows, np.int32),
     )
 

@@ -42,7 +42,7 @@ def plot(figures: dict, device: str, out: Path) -> None:
         share.bar(positions, values, bottom=bottom, label=label)
         bottom = [low + value for low, value in zip(bottom, values, strict=True)]
     share.set_xticks(positions, [str(number) for number in num_envs])
-    share.set(xlabel="environments", ylabel="share of an iteration's time", ylim=(0, 1.02))
-    share.legend(fontsize="small", loc="lower right")
+    share.set(xlabel="environments", ylabel="share of an iteration's time", ylim=(0, 1.15))
+    share.legend(fontsize="small", loc="upper center", ncols=3)
     drawing.suptitle(f"{figures['task']} on MJX ({figures['impl']}), {figures['devices']} × {device}")
     drawing.savefig(out, format="png", dpi=110)
