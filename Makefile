@@ -20,6 +20,8 @@ test:
 bench:  ## timed figures, JSON beside the tables
 	$(BIN)/python -m hasrl_jax.bench collector --json bench_collector.json
 	$(BIN)/python -m hasrl_jax.bench learner --json bench_learner.json
+	$(BIN)/python -m hasrl_jax.bench mjx --json bench_mjx.json
+	$(BIN)/python -m hasrl_jax.bench parity --json bench_parity.json
 
 lock:  ## after a change of dependencies in pyproject.toml
 	$(BIN)/pip install uv

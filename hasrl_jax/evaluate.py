@@ -151,7 +151,7 @@ def evaluate(arguments: list[str]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
-    parser.add_argument("--policy", help="a policy file")
+    parser.add_argument("--policy", help='a policy file (.npz), or "released"')
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=20.0, help="time limit of an episode")

@@ -36,7 +36,7 @@ def load_policy_parameters(
     if run_dir is not None:
         return _from_run(Path(run_dir))
     assert policy is not None
-    return _from_file(RELEASED if policy == "released" else Path(policy))
+    return _from_file(RELEASED if str(policy) == "released" else Path(policy))
 
 
 def policy_metadata(config: Config) -> dict[str, object]:

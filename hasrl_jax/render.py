@@ -212,7 +212,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         allow_abbrev=False,
     )
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is filmed")
-    parser.add_argument("--policy", type=Path, help="a policy file (.npz)")
+    parser.add_argument("--policy", type=Path, help='a policy file (.npz), or "released"')
     parser.add_argument("--out", type=Path, default=Path("policy.mp4"), help="the video")
     parser.add_argument("--strip", type=Path, help="a row of frames as one PNG; default: beside the video")
     parser.add_argument("--seconds", type=float, default=10.0)
