@@ -150,7 +150,9 @@ class MjxCollector:
 
         def begin(key: Array) -> CollectorState:
             env_key, noise_key = jax.random.split(key)
-            return CollectorState(self.engine.reset(env_key), jnp.zeros(self.plan.carry_shape), noise_key)
+            state = CollectorState(self.engine.reset(env_key), jnp.zeros(self.plan.carry_shape), noise_key)
+            # Types as a collection returns them, none of them weak: the second call would be compiled anew.
+            return jax.tree.map(lambda array: jnp.asarray(array, array.dtype), state)
 
         keys = jax.random.split(jax.random.PRNGKey(seed), self.plan.num_envs)
         return jax.jit(jax.vmap(begin), out_shardings=self._split)(keys)

@@ -15,12 +15,13 @@ import pytest
 from hasrl_jax import config as config_module
 from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.mjx import ActingParameters, CollectorState, MjxCollector, Statistics, make_mjx_plan
-from hasrl_jax.config import Config, ConfigError
+from hasrl_jax.collectors import MjxExperience
+from hasrl_jax.config import Config, ConfigError, from_dict, shipped
 from hasrl_jax.envs.cpu_env import StepResult
 from hasrl_jax.envs.mjx_env import make_engine
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task, Transition
-from hasrl_jax.learn import distributions, normalize
+from hasrl_jax.learn import distributions, normalize, ppo
 from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.learn.ppo import make_mesh
 from hasrl_jax.types import Trajectory
@@ -285,3 +286,24 @@ def test_too_little_memory_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(run.collector, "_jitted", fail)
     with pytest.raises(MemoryError, match=r"mjx.num_envs: 16 environments .* try 8"):
         run.collector(run.parameters, run.states[0], VERSION)
+
+
+def test_the_first_state_has_the_types_of_the_next() -> None:
+    """A weak type, as a Python number has, would have the second iteration compiled anew."""
+    changes = {
+        "mjx": {"num_envs": 2},
+        "collect": {"env_steps_per_iteration": 4, "unroll_length": 2},
+        "ppo": {"minibatch_trajectories": 2},
+    }
+    config = from_dict(changes, shipped("cassie_walk"))
+    task, mesh = make_task(config), ppo.make_mesh(jax.devices()[:1])
+    sizes = (task.observation_size, task.action_size, task.mirror)
+    learner = ppo.init_learner(config, *sizes, jax.random.key(0))
+    statistics = normalize.mean_std(learner.normalizer)
+    parameters = ActingParameters(learner.policy_params, learner.value_params, *statistics)
+    with MjxExperience(config, task, mesh) as experience:
+        after = jax.eval_shape(experience.collector._jitted, parameters, experience.state, jnp.int32(0))[0]
+        before = jax.eval_shape(lambda state: state, experience.state)
+    assert [(x.dtype, x.weak_type) for x in jax.tree.leaves(before)] == [
+        (x.dtype, x.weak_type) for x in jax.tree.leaves(after)
+    ]
