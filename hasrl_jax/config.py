@@ -120,6 +120,11 @@ class NetworkConfig:
     normalize_observations: bool = True  # running mean and variance, part of the checkpoint
     symmetric: bool = False  # mirror-equivariant policy and mirror-invariant value by construction
 
+    @property
+    def carry_shape(self) -> tuple[int, int, int]:
+        """(L, 2, W) of one LSTM carry: layers, (h, c), and the width of all streams side by side."""
+        return 2, 2, self.hidden_size * (2 if self.symmetric else 1)
+
 
 @dataclass(frozen=True)
 class CollectConfig:

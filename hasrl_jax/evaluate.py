@@ -49,8 +49,7 @@ def run_episodes(
     envs = CpuEnvs(task, episodes, cap)
     rng = np.random.Generator(np.random.Philox(seed))
     state = envs.reset(rng)
-    width = config.network.hidden_size * (1 if mirror is None else 2)
-    carry = np.zeros((episodes, numpy_policy.LAYERS, 2, width), np.float32)
+    carry = np.zeros((episodes, *config.network.carry_shape), np.float32)
     std = np.exp(numpy_policy.log_std(parameters, mirror))
     env_step_s = state.model_fields.get("timestep", task.model.opt.timestep) * task.steps_per_env_step
     total, length = np.zeros(episodes), np.zeros(episodes, np.int64)

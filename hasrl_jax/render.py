@@ -59,8 +59,7 @@ def play(env: "TaskEnv", parameters: dict[str, np.ndarray], frames: int, seed: i
     from hasrl_jax.collect import numpy_policy
 
     mirror = env.task.mirror if env.config.network.symmetric else None
-    width = env.config.network.hidden_size * (1 if mirror is None else 2)
-    carry = np.zeros((1, numpy_policy.LAYERS, 2, width), np.float32)
+    carry = np.zeros((1, *env.config.network.carry_shape), np.float32)
     env_step_s = env.task.env_step_s
     recent: deque[list[float]] = deque(maxlen=max(1, round(SPEED_AVERAGE_S / env_step_s)))
     observation, _ = env.reset(seed=seed)

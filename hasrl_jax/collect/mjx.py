@@ -111,8 +111,7 @@ def make_mjx_plan(config: Config, num_envs: int, num_devices: int) -> MjxPlan:
     minibatch = config.ppo.minibatch_trajectories
     multiple = minibatch // math.gcd(num_envs, minibatch)
     pieces = -(-pieces // multiple) * multiple
-    width = config.network.hidden_size * (2 if config.network.symmetric else 1)
-    return MjxPlan(num_envs, pieces * collect.unroll_length, collect.unroll_length, (2, 2, width))
+    return MjxPlan(num_envs, pieces * collect.unroll_length, collect.unroll_length, config.network.carry_shape)
 
 
 class MjxCollector:

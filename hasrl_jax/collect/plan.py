@@ -43,5 +43,4 @@ def make_plan(config: Config) -> Plan:
         max_length = min(collect.max_episode_steps, steps_per_env)
         rows = minibatch  # episodes vary in number: the batch grows by whole minibatches
     rows = -(-rows // minibatch) * minibatch
-    width = config.network.hidden_size * (2 if config.network.symmetric else 1)
-    return Plan(num_workers, envs_per_worker, steps_per_env, max_length, rows, (2, 2, width))
+    return Plan(num_workers, envs_per_worker, steps_per_env, max_length, rows, config.network.carry_shape)
