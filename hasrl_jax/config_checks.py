@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from hasrl_jax.config import CassieConfig, Config, ConfigError, shown
+from hasrl_jax.cassie_config import CassieConfig
+from hasrl_jax.config import Config, ConfigError, shown
 
 # Lowest and highest value of every numeric field, both included; of a range, for both of its ends.
 LIMITS: dict[str, tuple[float, float]] = {

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config import CassieConfig, Config
+from hasrl_jax.cassie_config import CassieConfig
+from hasrl_jax.config import Config
 from hasrl_jax.envs import clock, randomize, rewards
 from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition

@@ -6,7 +6,7 @@ Source: paper section II.C; constants of the published implementation.
 
 from typing import Any
 
-from hasrl_jax.config import ClockConfig
+from hasrl_jax.cassie_config import ClockConfig
 from hasrl_jax.types import Array
 
 EDGE = 0.10  # each interval is shortened at both ends by this share of its own length

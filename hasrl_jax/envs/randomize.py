@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from hasrl_jax.config import RandomizeConfig
+from hasrl_jax.cassie_config import RandomizeConfig
 from hasrl_jax.types import Array
 
 DAMPED_JOINTS = ("hip-roll", "hip-yaw", "hip-pitch", "achilles-rod", "knee", "shin", "tarsus", "foot-crank", "foot")

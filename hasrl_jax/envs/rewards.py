@@ -8,7 +8,7 @@ published implementation.
 
 from typing import Any
 
-from hasrl_jax.config import RewardConfig
+from hasrl_jax.cassie_config import RewardConfig
 from hasrl_jax.types import Array
 
 TERMS = (

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from hasrl_jax.config import ClockConfig
+from hasrl_jax.cassie_config import ClockConfig
 from hasrl_jax.envs import clock
 
 CONFIG = ClockConfig()

@@ -5,7 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config import PhysicsConfig, RandomizeConfig
+from hasrl_jax.cassie_config import RandomizeConfig
+from hasrl_jax.config import PhysicsConfig
 from hasrl_jax.envs import randomize
 from hasrl_jax.envs.model import load_model
 

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from hasrl_jax.config import Config, RewardConfig
+from hasrl_jax.cassie_config import RewardConfig
+from hasrl_jax.config import Config
 from hasrl_jax.envs import cassie, clock, rewards
 from hasrl_jax.envs.cpu_env import CpuEnvs
 from hasrl_jax.envs.task import Reading, Task

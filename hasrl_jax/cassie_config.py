@@ -1,0 +1,70 @@
+"""Settings of the walking task; part of `config.Config`, under `cassie`.
+
+Every field is read somewhere, and its comment gives its meaning and unit.
+"""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class CommandConfig:
+    forward_m_s: tuple[float, float] = (-0.3, 2.0)  # range of the commanded forward speed, m/s
+    lateral_m_s: tuple[float, float] = (-0.1, 0.1)  # range of the commanded lateral speed, m/s (left is positive)
+    stand_probability: float = 0.1  # share of draws that command zero speed
+    start_moving: float = 0.0  # share of episodes that start at the commanded speed instead of at rest
+    resample_s: tuple[float, float] = (2.0, 6.0)  # seconds between draws; (0, 0) keeps one draw per episode
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    cycle_s: float = 0.9  # gait cycle at zero speed, s
+    cycle_per_speed_s: float = -0.25 / 3  # change of the cycle per m/s of commanded speed, s
+    swing_fraction: float = 0.30  # share of each half cycle that is swing, at zero speed
+    swing_fraction_per_speed: float = 0.40 / 3  # change of that share per m/s
+    max_swing_fraction: float = 0.90  # upper bound of that share
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    scale: float = 2.0  # s, multiplies the sum of the weighted terms
+    foot_force: float = 0.200  # w1, weight of S_F
+    foot_velocity: float = 0.200  # w2, weight of S_V
+    orientation: float = 0.200  # w3, weight of exp(-(E_pel + E_foot))
+    pelvis_motion: float = 0.150  # w4, weight of exp(-P_m)
+    velocity: float = 0.150  # w5, weight of exp(-E_v)
+    hip_roll: float = 0.050  # w6, weight of exp(-H_p)
+    torque_change: float = 0.025  # w7, weight of exp(-T_p)
+    action_change: float = 0.025  # w8, weight of exp(-A_p)
+    velocity_sharpness: float = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
+    lateral_velocity_share: float = 1.0  # weight of the lateral speed error in E_v (the paper: 0)
+    height_m: float = 0.9  # pelvis height that P_m asks for, m
+    shaking: float = 0.25  # factor on summed |angular velocity| and |acceleration| of the pelvis in P_m
+    follow_lateral_command: bool = True  # P_m counts drift from the commanded path (the paper: from y = 0)
+
+
+@dataclass(frozen=True)
+class RandomizeConfig:
+    enabled: bool = True  # draw the model anew at each reset
+    damping_scale: tuple[float, float] = (0.3, 5.0)  # joint damping factor, per leg joint
+    mass_scale: tuple[float, float] = (0.5, 1.5)  # mass and inertia factor, per body
+    sliding_friction: tuple[float, float] = (0.4, 1.1)  # one draw for all geoms
+    torsional_friction: tuple[float, float] = (1e-4, 5e-4)  # one draw for all geoms, m
+    rolling_friction: tuple[float, float] = (1e-4, 2e-4)  # one draw for all geoms, m
+    encoder_offset_rad: float = 0.01  # half width of the encoder offset, per joint, constant in an episode, rad
+    physics_rate_scale: tuple[float, float] = (0.6, 1.2)  # factor on the physics step, hence the policy period
+
+
+@dataclass(frozen=True)
+class TerminationConfig:
+    min_height_m: float = 0.6  # the episode ends when the pelvis is lower (the paper: 0.4)
+    max_height_m: float = 3.0  # or higher
+    max_tilt_deg: float = 45.0  # or when the pelvis tilts further from upright (the paper: no bound, 180)
+
+
+@dataclass(frozen=True)
+class CassieConfig:
+    command: CommandConfig = field(default_factory=CommandConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
+    termination: TerminationConfig = field(default_factory=TerminationConfig)
