@@ -45,6 +45,7 @@ class RewardConfig:
 @dataclass(frozen=True)
 class RandomizeConfig:
     enabled: bool = True  # draw the model anew at each reset
+    share: float = 1.0  # share of episodes with a drawn model; the others have the nominal robot
     damping_scale: tuple[float, float] = (0.3, 5.0)  # joint damping factor, per leg joint
     mass_scale: tuple[float, float] = (0.5, 1.5)  # mass and inertia factor, per body
     sliding_friction: tuple[float, float] = (0.4, 1.1)  # one draw for all geoms
@@ -52,6 +53,13 @@ class RandomizeConfig:
     rolling_friction: tuple[float, float] = (1e-4, 2e-4)  # one draw for all geoms, m
     encoder_offset_rad: float = 0.01  # half width of the encoder offset, per joint, constant in an episode, rad
     physics_rate_scale: tuple[float, float] = (0.6, 1.2)  # factor on the physics step, hence the policy period
+
+
+@dataclass(frozen=True)
+class PushConfig:
+    force_n: tuple[float, float] = (0.0, 0.0)  # range of the horizontal force on the pelvis, N; (0, 0) never pushes
+    interval_s: tuple[float, float] = (3.0, 8.0)  # range of the time from reset, or the last push, to a push, s
+    duration_s: float = 0.2  # how long a push lasts
 
 
 @dataclass(frozen=True)
@@ -67,4 +75,5 @@ class CassieConfig:
     clock: ClockConfig = field(default_factory=ClockConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
+    push: PushConfig = field(default_factory=PushConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)

@@ -36,6 +36,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "cassie.reward.lateral_velocity_share": (0, 1e3),
     "cassie.reward.height_m": (0, 2),
     "cassie.reward.shaking": (0, 1e3),
+    "cassie.randomize.share": (0, 1),
     "cassie.randomize.damping_scale": (0, 100),
     "cassie.randomize.mass_scale": (0.01, 100),
     "cassie.randomize.sliding_friction": (0, 10),
@@ -43,6 +44,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "cassie.randomize.rolling_friction": (0, 1),
     "cassie.randomize.encoder_offset_rad": (0, 1),
     "cassie.randomize.physics_rate_scale": (0.05, 10),
+    "cassie.push.force_n": (0, 1e5),
+    "cassie.push.interval_s": (0, 1e6),
+    "cassie.push.duration_s": (0, 1e3),
     "cassie.termination.min_height_m": (0, 1),  # the robot starts at 1.01 m
     "cassie.termination.max_height_m": (1.02, 1e3),
     "cassie.termination.max_tilt_deg": (1, 180),

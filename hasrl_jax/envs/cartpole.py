@@ -42,6 +42,7 @@ def make(config: Config) -> Task:
         mirror=Mirror(np.arange(2), -np.ones(2, np.float32), np.arange(1), -np.ones(1, np.float32)),
         reset=reset,
         control=control,
+        force=None,
         physics_features=physics_features,
         step=step,
     )

@@ -24,6 +24,7 @@ NUM_ENCODERS = 16  # ten motors, six passive joints
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
 COMMAND_UNIFORMS = 4  # forward, lateral, stand or not, time until the next draw
+PUSH_UNIFORMS = 3  # force, direction, time until the push
 MEASURES = ("forward_speed", "lateral_speed", "forward_command", "lateral_command", "height", "heading")
 
 
@@ -34,6 +35,8 @@ class CassieState(NamedTuple):
     command: Array  # [..., 2] commanded forward and lateral speed, m/s
     command_s: Array  # [...] seconds until the command is drawn again
     path_y: Array  # [...] where the commanded lateral speed would have led, m
+    push: Array  # [..., 2] force of the next push, world x and y, N
+    push_s: Array  # [...] seconds until that push; it acts while this is not positive
     encoder_offset: Array  # [..., 16] of the motors and the passive joints, rad
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
@@ -70,13 +73,14 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=OBSERVATION_SIZE,
         action_size=ACTION_SIZE,
-        reset_uniforms=randomize.num_uniforms(nominal) + COMMAND_UNIFORMS + 2 + NUM_ENCODERS,
-        step_uniforms=COMMAND_UNIFORMS,
+        reset_uniforms=randomize.num_uniforms(nominal) + COMMAND_UNIFORMS + PUSH_UNIFORMS + 2 + NUM_ENCODERS,
+        step_uniforms=COMMAND_UNIFORMS + PUSH_UNIFORMS,
         reward_terms=rewards.TERMS,
         measures=MEASURES,
         mirror=mirror(),
         reset=partial(reset, constants),
         control=control,
+        force=partial(force, constants) if config.cassie.push.force_n[1] > 0 else None,
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )
@@ -86,19 +90,22 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
-    cuts = np.cumsum([randomize.num_uniforms(nominal), COMMAND_UNIFORMS, 1, 1])
-    model_u, command_u, phase_u, start_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
+    cuts = np.cumsum([randomize.num_uniforms(nominal), COMMAND_UNIFORMS, PUSH_UNIFORMS, 1, 1])
+    model_u, command_u, push_u, phase_u, start_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
 
     fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
-    offset = config.randomize.encoder_offset_rad if config.randomize.enabled else 0.0
+    offset = xp.where(randomize.is_drawn(model_u, config.randomize), config.randomize.encoder_offset_rad, 0.0)
     command, command_s = draw_command(command_u, config, xp)
+    push, push_s = draw_push(push_u, config, xp)
     state = CassieState(
         phase=phase_u[..., 0],
         command=command,
         command_s=command_s,
         path_y=xp.zeros(batch),
-        encoder_offset=offset * (2 * encoder_u - 1),
+        push=push,
+        push_s=push_s,
+        encoder_offset=offset[..., None] * (2 * encoder_u - 1),
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
@@ -114,6 +121,13 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
 def control(state: CassieState, action: Array, xp: Any) -> Array:
     """PD targets in rad, [..., 10]. The encoder offset enters because the PD loop reads the same encoder."""
     return xp.clip(action, -1.0, 1.0) + NEUTRAL_RAD - state.encoder_offset[..., :ACTION_SIZE]
+
+
+def force(constants: Constants, state: CassieState, xp: Any) -> Array:
+    """The push that acts now as a generalised force, [..., nv]: the first two entries move the pelvis along x and y."""
+    acting = xp.where((state.push_s <= 0)[..., None], state.push, 0.0)
+    rest = xp.zeros((*state.push_s.shape, len(constants.nominal.dof_damping) - 2))
+    return xp.concatenate([acting, rest], axis=-1)
 
 
 def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
@@ -144,6 +158,7 @@ def step(
     measures = xp.concatenate([forward_lateral, state.command, xp.stack([height, heading(quat, xp)], axis=-1)], axis=-1)
 
     drawn, drawn_s = draw_command(uniforms, config, xp)
+    push, push_s = next_push(state, uniforms[..., COMMAND_UNIFORMS:], config, xp)
     due = state.command_s <= state.env_step_s
     cycle_s = clock.cycle_seconds(state.command[..., 0], config.clock, xp)
     state = state._replace(
@@ -152,6 +167,8 @@ def step(
         command=xp.where(due[..., None], drawn, state.command),
         command_s=xp.where(due, drawn_s, state.command_s - state.env_step_s),
         path_y=path_y,
+        push=push,
+        push_s=push_s,
         action=action,
         torque=torque,
     )
@@ -219,6 +236,24 @@ def draw_command(uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array,
     command = xp.where(stand, 0.0, xp.stack([forward, lateral], axis=-1))
     seconds = randomize.between(uniforms[..., 3], settings.resample_s)
     return command, xp.where(seconds > 0, seconds, xp.inf)
+
+
+def draw_push(uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array, Array]:
+    """Uniform numbers [..., 3] to a force [..., 2] in N, in any horizontal direction, and the seconds until it acts."""
+    size = randomize.between(uniforms[..., 0:1], config.push.force_n)
+    angle = 2 * np.pi * uniforms[..., 1]
+    force = size * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
+    return force, randomize.between(uniforms[..., 2], config.push.interval_s)
+
+
+def next_push(state: CassieState, uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array, Array]:
+    """The push and the time until it after one environment step; a push that is over gives way to a new draw."""
+    if config.push.force_n[1] == 0:
+        return state.push, state.push_s
+    remaining = state.push_s - state.env_step_s
+    over = remaining <= -config.push.duration_s
+    push, push_s = draw_push(uniforms, config, xp)
+    return xp.where(over[..., None], push, state.push), xp.where(over, push_s, remaining)
 
 
 def up_in_body_frame(quat: Array, xp: Any) -> Array:

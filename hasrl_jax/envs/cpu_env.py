@@ -17,6 +17,7 @@ from hasrl_jax.types import Array
 
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
+FORCE = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value
 
 
 class EnvState(NamedTuple):
@@ -65,7 +66,9 @@ class CpuEnvs:
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
         self._states = np.empty((num_envs, task.steps_per_env_step, size))
         self._sensordata = np.empty((num_envs, task.steps_per_env_step, task.model.nsensordata))
-        self._controls = np.empty((num_envs, task.steps_per_env_step, task.model.nu))
+        inputs = task.model.nu + (task.model.nv if task.force else 0)
+        self._control_spec = CONTROL | FORCE if task.force else CONTROL
+        self._controls = np.empty((num_envs, task.steps_per_env_step, inputs))
 
     def reset(self, rng: np.random.Generator) -> EnvState:
         """Fresh episodes in all environments."""
@@ -124,14 +127,16 @@ class CpuEnvs:
     def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[Reading, np.ndarray]:
         """Runs the physics steps of one environment step; also says which simulations diverged, [E] bool."""
         task, model = self.task, self.task.model
-        self._controls[:] = control[:, None]
+        self._controls[:, :, : model.nu] = control[:, None]
+        if task.force:
+            self._controls[:, :, model.nu :] = task.force(state.task, np)[:, None]
         cpu = time.process_time()
         self._rollout.rollout(
             self._models,
             [self._data],
             state.physics,
             self._controls,
-            control_spec=CONTROL,
+            control_spec=self._control_spec,
             skip_checks=True,
             nstep=task.steps_per_env_step,
             state=self._states,

@@ -135,6 +135,8 @@ class MjxEngine:
 
         # Like the C engine, every environment step starts from a zero warm start, so its state is qpos and qvel.
         data = self.data.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control)
+        if task.force:
+            data = data.replace(qfrc_applied=task.force(state.task, jnp))
         total = jnp.zeros_like(task.physics_features(data.sensordata, jnp))
         (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), None, length=task.steps_per_env_step)
         return Reading(data.qpos, data.qvel, data.sensordata, total / task.steps_per_env_step), _overflow(data)
@@ -146,7 +148,7 @@ class MjxEngine:
         """
         if self.model.impl == mjx.Impl.WARP:
             return data
-        names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "sensordata")
+        names = ("qpos", "qvel", "ctrl", "qfrc_applied", "qacc_warmstart", "sensordata")
         return self.data.replace(**{name: getattr(data, name) for name in names})
 
 

@@ -47,8 +47,13 @@ def nominal(model: mujoco.MjModel) -> Nominal:
 
 
 def num_uniforms(constants: Nominal) -> int:
-    """Uniform numbers that `model_fields` consumes: damping, mass, friction (3), physics rate."""
-    return constants.num_damping + len(constants.body_mass) - 1 + 3 + 1
+    """Uniform numbers that `model_fields` consumes: damping, mass, friction (3), physics rate, whether at all."""
+    return constants.num_damping + len(constants.body_mass) - 1 + 3 + 1 + 1
+
+
+def is_drawn(uniforms: Array, config: RandomizeConfig) -> Array:
+    """Whether an episode's robot is a drawn one, [...] bool; `uniforms` as in `model_fields`."""
+    return (uniforms[..., -1] < config.share) & config.enabled
 
 
 def model_fields(uniforms: Array, constants: Nominal, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
@@ -66,14 +71,16 @@ def model_fields(uniforms: Array, constants: Nominal, config: RandomizeConfig, x
     """
     if not config.enabled:
         return {}
-    cuts = np.cumsum([constants.num_damping, len(constants.body_mass) - 1, 3])
-    damping_u, mass_u, friction_u, rate_u = (
+    drawn = is_drawn(uniforms, config)[..., None]
+    cuts = np.cumsum([constants.num_damping, len(constants.body_mass) - 1, 3, 1])
+    damping_u, mass_u, friction_u, rate_u, _ = (
         uniforms[..., start:end] for start, end in zip([0, *cuts], [*cuts, None], strict=True)
     )
     # A column of ones serves the degrees of freedom (index -1) and the world body that keep their value.
     ones = xp.ones_like(uniforms[..., :1])
-    damping_scale = xp.concatenate([between(damping_u, config.damping_scale), ones], axis=-1)
-    mass_scale = xp.concatenate([ones, between(mass_u, config.mass_scale)], axis=-1)
+    damping_scale = xp.concatenate([xp.where(drawn, between(damping_u, config.damping_scale), 1.0), ones], axis=-1)
+    mass_scale = xp.concatenate([ones, xp.where(drawn, between(mass_u, config.mass_scale), 1.0)], axis=-1)
+    rate_scale = xp.where(drawn, between(rate_u, config.physics_rate_scale), 1.0)
     friction = xp.stack(
         [
             between(friction_u[..., i], bounds)
@@ -87,8 +94,8 @@ def model_fields(uniforms: Array, constants: Nominal, config: RandomizeConfig, x
         "body_inertia": constants.body_inertia * mass_scale[..., None],
         "body_subtreemass": mass @ constants.subtree.T,
         "dof_damping": constants.dof_damping * damping_scale[..., constants.dof_draw],
-        "geom_friction": xp.ones_like(constants.geom_friction) * friction[..., None, :],
-        "timestep": constants.timestep * between(rate_u[..., 0], config.physics_rate_scale),
+        "geom_friction": xp.where(drawn[..., None], friction[..., None, :], constants.geom_friction),
+        "timestep": constants.timestep * rate_scale[..., 0],
     }
 
 

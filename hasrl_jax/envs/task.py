@@ -61,6 +61,7 @@ class Task:
     mirror: Mirror | None
     reset: Callable[[Array, Any], Reset]  # (uniforms [..., reset_uniforms], xp)
     control: Callable[[Any, Array, Any], Array]  # (state, action [..., A], xp) -> ctrl [..., nu]
+    force: Callable[[Any, Any], Array] | None  # (state, xp) -> force from outside on each qvel [..., nv]
     physics_features: Callable[[Array, Any], Array]  # (sensordata [..., ns], xp) -> [..., F]
     step: Callable[[Any, Array, Reading, Array, Any], Transition]  # (state, action, reading, uniforms, xp)
 

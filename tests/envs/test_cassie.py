@@ -107,6 +107,45 @@ def test_a_share_of_episodes_starts_at_the_commanded_speed() -> None:
     assert not fresh.qvel[:, 2:].any()
 
 
+def test_a_push_acts_for_its_time_and_is_then_drawn_again() -> None:
+    settings = {"force_n": [50.0, 150.0], "interval_s": [0.5, 1.0], "duration_s": 0.2}
+    task, _ = _make(push=settings, termination={"min_height_m": 0.0, "max_tilt_deg": 180.0}, **NOMINAL_ROBOT)
+    envs = CpuEnvs(task, 2, 1000)
+    assert task.force is not None
+    rng = np.random.default_rng(0)
+    state, forces = envs.reset(rng), []
+    for _ in range(100):
+        forces.append(task.force(state.task, np))
+        state, _ = envs.step(state, np.zeros((envs.num_envs, 10)), rng)
+    forces = np.array(forces)
+    assert not forces[..., 2:].any()
+    size = np.linalg.norm(forces[..., :2], axis=-1)
+    assert ((size == 0) | ((size >= 50) & (size <= 150))).all()
+    acting = np.pad(size[:, 0] > 0, (1, 0))
+    begins, ends = np.flatnonzero(np.diff(acting.astype(int)) == 1), np.flatnonzero(np.diff(acting.astype(int)) == -1)
+    assert len(ends) >= 2
+    assert all(end - begin == 8 for begin, end in zip(begins, ends, strict=False))  # 0.2 s of 25 ms
+    assert 20 <= begins[0] <= 40
+    assert len(set(size[begins, 0])) == len(begins)
+
+
+def test_a_push_changes_the_momentum_by_force_times_time() -> None:
+    """In free fall nothing else acts along x and y; masses in kg, speeds of the centre of mass in m/s."""
+    task, _ = _make(push={"force_n": [100.0, 100.0], "interval_s": [0.0, 0.0], "duration_s": 10.0}, **NOMINAL_ROBOT)
+    envs, rng = CpuEnvs(task, 1, 1000), np.random.default_rng(0)
+    state = envs.reset(rng)
+    physics = state.physics.copy()
+    physics[:, 3] += 1.5
+    state = state._replace(physics=physics)
+    state, _ = envs.step(state, np.zeros((1, 10)), rng)
+    data = mujoco.MjData(task.model)
+    mujoco.mj_setState(task.model, data, state.physics[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    mujoco.mj_forward(task.model, data)
+    mujoco.mj_subtreeVel(task.model, data)
+    momentum = data.subtree_linvel[0, :2] * task.model.body_subtreemass[0]
+    np.testing.assert_allclose(np.linalg.norm(momentum), 100.0 * task.env_step_s, rtol=0.02)
+
+
 def _mirror_physics(task: Task, physics: np.ndarray) -> np.ndarray:
     """The mirror image of (time, qpos, qvel), by joint name."""
     model, mirrored = task.model, physics.copy()

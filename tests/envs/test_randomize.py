@@ -84,5 +84,16 @@ def test_same_uniforms_same_fields(uniforms: np.ndarray, fields: dict[str, np.nd
         np.testing.assert_allclose(values, jax_fields[name], rtol=1e-5, err_msg=name)
 
 
+def test_a_share_of_the_robots_is_drawn(uniforms: np.ndarray) -> None:
+    config = RandomizeConfig(share=0.3)
+    fields, drawn = randomize.model_fields(uniforms, NOMINAL, config, np), randomize.is_drawn(uniforms, config)
+    assert 0.2 < drawn.mean() < 0.4
+    everywhere = randomize.model_fields(uniforms, NOMINAL, CONFIG, np)
+    for name, values in fields.items():
+        own = MODEL.opt.timestep if name == "timestep" else getattr(MODEL, name)
+        np.testing.assert_array_equal(values[drawn], everywhere[name][drawn])
+        np.testing.assert_allclose(values[~drawn], np.broadcast_to(own, values[~drawn].shape), rtol=1e-12)
+
+
 def test_off_switch(uniforms: np.ndarray) -> None:
     assert randomize.model_fields(uniforms, NOMINAL, RandomizeConfig(enabled=False), np) == {}
