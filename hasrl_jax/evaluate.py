@@ -32,7 +32,12 @@ class Episodes(NamedTuple):
 
 
 def run_episodes(
-    config: Config, task: Task, parameters: numpy_policy.Parameters, episodes: int, seed: int, mean_action: bool = True
+    config: Config,
+    task: Task,
+    parameters: numpy_policy.Parameters,
+    episodes: int,
+    seed: int | list[int],
+    mean_action: bool = True,
 ) -> Episodes:
     """Plays `episodes` episodes side by side in C MuJoCo, with the LSTM state carried through each.
 
@@ -41,7 +46,7 @@ def run_episodes(
       task: the task to play.
       parameters: as `learn.ppo.export_parameters` returns them.
       episodes: N.
-      seed: the same seed gives the same episodes.
+      seed: one number or several; the same seed gives the same episodes.
       mean_action: act without exploration noise.
     """
     mirror = task.mirror if config.network.symmetric else None
@@ -92,21 +97,23 @@ def _speeds(episodes: Episodes, task: Task) -> dict[str, Any]:
     """Speed, command and their difference after settling, averaged per episode first."""
     column = {name: episodes.measures[..., index] for index, name in enumerate(task.measures)}
     settled = settled_steps(column["forward_command"], round(SETTLE_S / task.env_step_s))
-    has_any = settled.any(axis=0)
-
-    def settled_mean(values: np.ndarray) -> np.ndarray:
-        return np.where(settled, values, 0.0).sum(axis=0)[has_any] / settled.sum(axis=0)[has_any]
-
-    forward, lateral = column["forward_speed"], column["lateral_speed"]
-    error, lateral_error = forward - column["forward_command"], lateral - column["lateral_command"]
+    error = column["forward_speed"] - column["forward_command"]
+    lateral_error = column["lateral_speed"] - column["lateral_command"]
+    signed, lateral_signed = settled_mean(error, settled), settled_mean(lateral_error, settled)
     return {
-        "settled_episodes": int(has_any.sum()),
-        "forward_speed": mean_interval(settled_mean(forward)),
-        "forward_command": mean_interval(settled_mean(column["forward_command"])),
-        "forward_speed_error": mean_interval(np.abs(settled_mean(error))),
-        "lateral_speed_error": mean_interval(np.abs(settled_mean(lateral_error))),
-        "forward_speed_error_instantaneous": mean_interval(settled_mean(np.abs(error))),
+        "settled_episodes": int(settled.any(axis=0).sum()),
+        "forward_speed": mean_interval(settled_mean(column["forward_speed"], settled)),
+        "forward_command": mean_interval(settled_mean(column["forward_command"], settled)),
+        "forward_speed_error": mean_interval(np.abs(signed)),
+        "lateral_speed_error": mean_interval(np.abs(lateral_signed)),
+        "forward_speed_error_instantaneous": mean_interval(settled_mean(np.abs(error), settled)),
     }
+
+
+def settled_mean(values: np.ndarray, settled: np.ndarray) -> np.ndarray:
+    """Mean of each episode's `values` [T, N] where `settled` [T, N]: [N], NaN for an episode that never settled."""
+    counts = settled.sum(axis=0)
+    return np.where(counts > 0, np.where(settled, values, 0.0).sum(axis=0) / np.maximum(counts, 1), np.nan)
 
 
 def settled_steps(command: np.ndarray, settle_steps: int) -> np.ndarray:
@@ -119,7 +126,8 @@ def settled_steps(command: np.ndarray, settle_steps: int) -> np.ndarray:
 
 
 def mean_interval(values: np.ndarray) -> dict[str, float | None]:
-    """Mean and the 95 % normal confidence interval of the mean; None without values."""
+    """Mean of the values that are numbers and its 95 % normal confidence interval; None without any."""
+    values = values[np.isfinite(values)]
     if len(values) == 0:
         return {"mean": None, "low": None, "high": None}
     half = 1.96 * np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0

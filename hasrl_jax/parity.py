@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.config import Config
-from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.mjx_env import MjxEngine, MjxEnvState, make_engine
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
@@ -31,6 +31,7 @@ class Recording(NamedTuple):
 
     observation: np.ndarray  # [S, N, O]
     reward_terms: np.ndarray  # [S, N, R]
+    measures: np.ndarray  # [S, N, M]
     terminated: np.ndarray  # [S, N] bool
     diverged: np.ndarray  # [S, N] bool
     loop_error: np.ndarray  # [S, N] largest gap of the closed loops, m
@@ -68,10 +69,10 @@ def measure(
     Returns:
       {"settings": {...}, "horizons": {steps: {quantity: {"max", "mean"}, ...}}}, ready for JSON. For every horizon:
       `observation` and every reward term (absolute differences after that many environment steps, or in the last step
-      of an episode that ended before), `observation_relative` (to the deviation of each element over the environments),
-      `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m` (likewise, but one step earlier where an episode
-      ended), `still_running` (share of environments that neither engine ended before the horizon) and
-      `termination_agreement` (share of environments that both engines ended at the same step, or not at all).
+      of an episode that ended before), `observation_relative` and `measures_relative` (to the deviation of each element
+      over the environments), `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m` (likewise, but one step
+      earlier where an episode ended), `still_running` (share of environments that neither engine ended before the
+      horizon) and `termination_agreement` (share that both engines ended at the same step, or not at all).
     """
     task = make_task(config)
     rng = np.random.default_rng(seed)
@@ -121,7 +122,7 @@ def run_c(task: Task, start: EnvState, actions: np.ndarray, uniforms: np.ndarray
     for action, draws.uniforms in zip(actions, uniforms, strict=True):
         state, result = envs.step(state, action, draws)  # type: ignore[arg-type]
         gap = loop_errors(task.model, state.physics[:, 1 : 1 + task.model.nq])
-        rows.append(Recording(result.final_observation, result.reward_terms, result.terminated, result.diverged, gap))
+        rows.append(_row(result, gap))
     return Recording(*map(np.stack, zip(*rows, strict=True)))
 
 
@@ -133,8 +134,14 @@ def run_mjx(engine: MjxEngine, start: EnvState, actions: np.ndarray, uniforms: n
     for action, draw in zip(actions, uniforms, strict=True):
         state, result = advance(state, jnp.asarray(action), jnp.asarray(draw))
         gap = loop_errors(engine.task.model, np.asarray(state.qpos, np.float64))
-        rows.append(Recording(result.final_observation, result.reward_terms, result.terminated, result.diverged, gap))
+        rows.append(_row(result, gap))
     return Recording(*(np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)))
+
+
+def _row(result: StepResult, loop_error: np.ndarray) -> Recording:
+    """One environment step of all environments."""
+    outcome = result.final_observation, result.reward_terms, result.measures, result.terminated, result.diverged
+    return Recording(*outcome, loop_error)
 
 
 def from_c(task: Task, state: EnvState) -> MjxEnvState:
@@ -192,11 +199,12 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
     closed = np.minimum(end, steps)[whole] - 1, envs[whole]
 
     difference = np.abs(reference.observation[last] - ours.observation[last])
-    spread = np.maximum(reference.observation[last].std(axis=0), SMALLEST_SPREAD) if difference.size else 1.0
+    measures = np.abs(reference.measures[last] - ours.measures[last])
     terms = np.abs(reference.reward_terms[last] - ours.reward_terms[last])
     result: dict[str, Any] = {
         "observation": summary(difference),
-        "observation_relative": summary(difference / spread),
+        "observation_relative": summary(difference / _spread(reference.observation[last])),
+        "measures_relative": summary(measures / _spread(reference.measures[last])),
         **{name: summary(terms[:, i]) for i, name in enumerate(task.reward_terms)},
         "loop_error_difference_m": summary(np.abs(reference.loop_error[closed] - ours.loop_error[closed])),
         "loop_error_c_m": summary(reference.loop_error[closed]),
@@ -205,6 +213,11 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
         "termination_agreement": float((ends[0] == ends[1]).mean()),
     }
     return result
+
+
+def _spread(values: np.ndarray) -> np.ndarray | float:
+    """The deviation of each element over the environments, [N, K] -> [K], and not less than SMALLEST_SPREAD."""
+    return np.maximum(values.std(axis=0), SMALLEST_SPREAD) if values.size else 1.0
 
 
 def first_end(recording: Recording, steps: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hasrl_jax.cassie_config import CassieConfig
 from hasrl_jax.config import Config
-from hasrl_jax.envs import clock, randomize, rewards
+from hasrl_jax.envs import clock, commands, randomize, rewards
 from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
@@ -23,9 +23,14 @@ NUM_ENCODERS = 16  # ten motors, six passive joints
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
-COMMAND_UNIFORMS = 4  # forward, lateral, stand or not, time until the next draw
-PUSH_UNIFORMS = 3  # force, direction, time until the push
-MEASURES = ("forward_speed", "lateral_speed", "forward_command", "lateral_command", "height", "heading")
+MEASURES = (
+    *("forward_speed", "lateral_speed"),  # of the pelvis at the end of the environment step, m/s
+    *("forward_command", "lateral_command"),  # that held during the environment step, m/s
+    *("height", "heading"),  # of the pelvis at the end of the environment step, m and rad
+    *("left_force", "right_force"),  # ground force on each foot, mean over the physics steps, N
+    "motor_power",  # sum of |torque * joint velocity| over the motors, mean over the physics steps, W
+    "phase",  # of the gait clock by which the environment step was judged, [0, 1)
+)
 
 
 class CassieState(NamedTuple):
@@ -66,6 +71,7 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         env_step_s=config.physics.timestep_s * config.physics.steps_per_env_step,
     )
+    drawn = commands.COMMAND_UNIFORMS + commands.PUSH_UNIFORMS
     return Task(
         name="cassie",
         asset=ASSET,
@@ -73,8 +79,8 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=OBSERVATION_SIZE,
         action_size=ACTION_SIZE,
-        reset_uniforms=randomize.num_uniforms(nominal) + COMMAND_UNIFORMS + PUSH_UNIFORMS + 2 + NUM_ENCODERS,
-        step_uniforms=COMMAND_UNIFORMS + PUSH_UNIFORMS,
+        reset_uniforms=randomize.num_uniforms(nominal) + drawn + 2 + NUM_ENCODERS,
+        step_uniforms=drawn,
         reward_terms=rewards.TERMS,
         measures=MEASURES,
         mirror=mirror(),
@@ -90,14 +96,14 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
-    cuts = np.cumsum([randomize.num_uniforms(nominal), COMMAND_UNIFORMS, PUSH_UNIFORMS, 1, 1])
+    cuts = np.cumsum([randomize.num_uniforms(nominal), commands.COMMAND_UNIFORMS, commands.PUSH_UNIFORMS, 1, 1])
     model_u, command_u, push_u, phase_u, start_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
 
     fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
     offset = xp.where(randomize.is_drawn(model_u, config.randomize), config.randomize.encoder_offset_rad, 0.0)
-    command, command_s = draw_command(command_u, config, xp)
-    push, push_s = draw_push(push_u, config, xp)
+    command, command_s = commands.draw_command(command_u, config.command, xp)
+    push, push_s = commands.draw_push(push_u, config.push, xp)
     state = CassieState(
         phase=phase_u[..., 0],
         command=command,
@@ -131,10 +137,15 @@ def force(constants: Constants, state: CassieState, xp: Any) -> Array:
 
 
 def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
-    """What the reward averages over physics steps: ground force (N) and orientation error of each foot, [..., 4]."""
+    """What is averaged over physics steps, [..., 5]: ground force (N) and orientation error of each foot, motor power.
+
+    The power, sum |torque * joint velocity| in W, is for the measures: read at the end of an environment step, when the
+    PD loop has calmed down, it would be up to a fifth too low.
+    """
     ids = constants.ids
     error = rewards.quaternion_error(sensordata[..., ids.foot_orientation], np.array(rewards.NEUTRAL_FOOT_QUAT), xp)
-    return xp.concatenate([sensordata[..., ids.foot_force], error], axis=-1)
+    power = xp.sum(xp.abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]), axis=-1, keepdims=True)
+    return xp.concatenate([sensordata[..., ids.foot_force], error, power], axis=-1)
 
 
 def step(
@@ -154,11 +165,13 @@ def step(
     limits = config.termination
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
-    forward_lateral = reading.qvel[..., :2]
-    measures = xp.concatenate([forward_lateral, state.command, xp.stack([height, heading(quat, xp)], axis=-1)], axis=-1)
+    posture = xp.stack([height, heading(quat, xp)], axis=-1)
+    gait = [reading.averages[..., :2], reading.averages[..., 4:], state.phase[..., None]]
+    measures = xp.concatenate([reading.qvel[..., :2], state.command, posture, *gait], axis=-1)
 
-    drawn, drawn_s = draw_command(uniforms, config, xp)
-    push, push_s = next_push(state, uniforms[..., COMMAND_UNIFORMS:], config, xp)
+    drawn, drawn_s = commands.draw_command(uniforms, config.command, xp)
+    push_u = uniforms[..., commands.COMMAND_UNIFORMS :]
+    push, push_s = commands.next_push(state.push, state.push_s, state.env_step_s, push_u, config.push, xp)
     due = state.command_s <= state.env_step_s
     cycle_s = clock.cycle_seconds(state.command[..., 0], config.clock, xp)
     state = state._replace(
@@ -225,35 +238,6 @@ def reward_errors(
         "torque_change": 0.25 * xp.mean(torque_change, axis=-1),
         "action_change": 5 * xp.mean(xp.abs(action - state.action), axis=-1),
     }
-
-
-def draw_command(uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array, Array]:
-    """Uniform numbers [..., 4] to a command [..., 2] in m/s and the seconds until the next draw [...]."""
-    settings = config.command
-    forward = randomize.between(uniforms[..., 0], settings.forward_m_s)
-    lateral = randomize.between(uniforms[..., 1], settings.lateral_m_s)
-    stand = uniforms[..., 2:3] < settings.stand_probability
-    command = xp.where(stand, 0.0, xp.stack([forward, lateral], axis=-1))
-    seconds = randomize.between(uniforms[..., 3], settings.resample_s)
-    return command, xp.where(seconds > 0, seconds, xp.inf)
-
-
-def draw_push(uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array, Array]:
-    """Uniform numbers [..., 3] to a force [..., 2] in N, in any horizontal direction, and the seconds until it acts."""
-    size = randomize.between(uniforms[..., 0:1], config.push.force_n)
-    angle = 2 * np.pi * uniforms[..., 1]
-    force = size * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
-    return force, randomize.between(uniforms[..., 2], config.push.interval_s)
-
-
-def next_push(state: CassieState, uniforms: Array, config: CassieConfig, xp: Any) -> tuple[Array, Array]:
-    """The push and the time until it after one environment step; a push that is over gives way to a new draw."""
-    if config.push.force_n[1] == 0:
-        return state.push, state.push_s
-    remaining = state.push_s - state.env_step_s
-    over = remaining <= -config.push.duration_s
-    push, push_s = draw_push(uniforms, config, xp)
-    return xp.where(over[..., None], push, state.push), xp.where(over, push_s, remaining)
 
 
 def up_in_body_frame(quat: Array, xp: Any) -> Array:

@@ -43,6 +43,7 @@ class CassieIds(NamedTuple):
     foot_orientation: np.ndarray  # [2, 4]
     foot_velocity: np.ndarray  # [2, 3]
     torque: np.ndarray  # [10]
+    motor_speed: np.ndarray  # [10]
 
 
 def cassie_ids(model: mujoco.MjModel) -> CassieIds:
@@ -64,4 +65,5 @@ def cassie_ids(model: mujoco.MjModel) -> CassieIds:
         foot_orientation=sensors("left-foot-orientation", "right-foot-orientation"),
         foot_velocity=sensors("left-foot-velocity", "right-foot-velocity"),
         torque=sensors(*(f"{side}-{name}-torque" for side in SIDES for name in MOTORS))[:, 0],
+        motor_speed=sensors(*(f"{side}-{name}-speed" for side in SIDES for name in MOTORS))[:, 0],
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config import Config, from_dict
-from hasrl_jax.envs import cassie
+from hasrl_jax.envs import cassie, commands
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
 from hasrl_jax.envs.task import Reading, Task
 
@@ -35,7 +35,7 @@ def _moving_state(steps: int = 6, seed: int = 0, **changes: dict) -> tuple[Task,
 
 def _still_reading(task: Task, qpos: np.ndarray) -> Reading:
     """A robot that does not move, with sensors that read nothing."""
-    sizes = (task.model.nv, task.model.nsensordata, 4)
+    sizes = (task.model.nv, task.model.nsensordata, 5)
     return Reading(qpos, *(np.zeros((*qpos.shape[:-1], size)) for size in sizes))
 
 
@@ -48,7 +48,7 @@ def test_observation_index_by_index() -> None:
     data.qvel[:] = rng.normal(size=model.nv)
     mujoco.mj_forward(model, data)
     fresh = task.reset(rng.random((1, task.reset_uniforms)), np)
-    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 4)))
+    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 5)))
     result = task.step(fresh.state, np.zeros((1, 10)), reading, rng.random((1, task.step_uniforms)), np)
     observation, offset = result.observation[0], fresh.state.encoder_offset[0]
 
@@ -81,7 +81,7 @@ def test_acceleration_is_minus_gravity_in_free_fall() -> None:
     data.ctrl[:] = cassie.NEUTRAL_RAD
     mujoco.mj_step(task.model, data, 40)  # the springs settle
     fresh = task.reset(np.zeros((1, task.reset_uniforms)), np)
-    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 4)))
+    reading = Reading(data.qpos[None], data.qvel[None], data.sensordata[None], np.zeros((1, 5)))
     result = task.step(fresh.state, np.zeros((1, 10)), reading, np.zeros((1, task.step_uniforms)), np)
     np.testing.assert_allclose(result.observation[0, 31:34], [0, 0, -9.81], atol=0.6)  # the legs still swing a little
 
@@ -214,7 +214,7 @@ def test_commands_are_drawn_again_when_due() -> None:
     fresh = task.reset(np.random.default_rng(0).random((2, task.reset_uniforms)), np)
     step_s = fresh.state.env_step_s
     state = fresh.state._replace(command_s=np.array([step_s[0] * 0.5, 3.0]))
-    uniforms = np.tile([1.0, 0.0, 0.9, 0.25], (2, 1))
+    uniforms = np.tile([1.0, 0.0, 0.9, 0.25, 0.0, 0.0, 0.0], (2, 1))
     result = task.step(state, np.zeros((2, 10)), _still_reading(task, fresh.qpos), uniforms, np)
     np.testing.assert_allclose(result.state.command[0], [2.0, -0.1])
     np.testing.assert_allclose(result.state.command_s[0], 3.0)
@@ -224,19 +224,19 @@ def test_commands_are_drawn_again_when_due() -> None:
 
 
 def test_command_draws() -> None:
-    settings = Config().cassie
+    settings = Config().cassie.command
     uniforms = np.random.default_rng(0).random((2000, 4))
-    command, seconds = cassie.draw_command(uniforms, settings, np)
+    command, seconds = commands.draw_command(uniforms, settings, np)
     standing = (command == 0).all(axis=1)
     assert 0.07 < standing.mean() < 0.13
-    low, high = settings.command.forward_m_s
+    low, high = settings.forward_m_s
     assert low <= command[:, 0].min() < low + 0.1
     assert high - 0.1 < command[:, 0].max() < high
     assert np.abs(command[:, 1]).max() <= 0.1
     assert seconds.min() >= 2
     assert seconds.max() < 6
-    once = from_dict({"cassie": {"command": {"resample_s": [0, 0]}}}).cassie
-    assert np.isinf(cassie.draw_command(uniforms, once, np)[1]).all()  # one command per episode
+    once = from_dict({"cassie": {"command": {"resample_s": [0, 0]}}}).cassie.command
+    assert np.isinf(commands.draw_command(uniforms, once, np)[1]).all()  # one command per episode
 
 
 def test_path_follows_the_commanded_lateral_speed() -> None:
@@ -277,6 +277,24 @@ def test_yaw_alone_never_terminates_and_is_reported() -> None:
     result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 4)), np)
     assert not result.terminated[0]
     assert result.measures[0, task.measures.index("heading")] == pytest.approx(2.0)
+
+
+def test_measures_for_gait_analysis_are_means_over_the_physics_steps() -> None:
+    task, envs, state, action = _moving_state(steps=16, **NOMINAL_ROBOT)
+    model, data = task.model, mujoco.MjData(task.model)
+    mujoco.mj_setState(model, data, state.physics[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    data.ctrl[:] = task.control(state.task, action, np)[0]
+    forces, powers = [], []
+    for _ in range(task.steps_per_env_step):
+        mujoco.mj_step(model, data)
+        forces.append([data.sensor(f"{side}-foot-force").data[0] for side in ("left", "right")])
+        powers.append(np.abs(data.actuator_force * data.actuator_velocity).sum())  # unit gears: of the joints
+    _, result = envs.step(state, action, np.random.default_rng(0))
+    measures = dict(zip(task.measures, result.measures[0], strict=True))
+    assert max(map(max, forces)) > 10  # a foot is on the ground
+    np.testing.assert_allclose([measures["left_force"], measures["right_force"]], np.mean(forces, axis=0), rtol=1e-9)
+    assert measures["motor_power"] == pytest.approx(np.mean(powers), rel=1e-9)
+    assert measures["phase"] == state.task.phase[0]
 
 
 def test_the_clock_advances_by_one_environment_step() -> None:

@@ -118,7 +118,7 @@ def test_cassie_agrees_with_c_in_double_precision() -> None:
     task = make_task(config)
     for horizon, tolerance in (("1", 1e-9), ("3", 1e-4)):
         result = report["horizons"][horizon]
-        for name in ("observation", *task.reward_terms, "loop_error_difference_m"):
+        for name in ("observation", "measures_relative", *task.reward_terms, "loop_error_difference_m"):
             assert result[name]["max"] < tolerance, (horizon, name)
         assert result["termination_agreement"] == 1.0
         assert result["still_running"] == 1.0

@@ -80,7 +80,7 @@ def _step(constants: cassie.Constants, task: Task, **changes: np.ndarray):
     sensors[0, ids.acceleration] = 0, 0, 9.81 + 1.0
     sensors[0, ids.torque] = 4.0
     sensors[0, ids.foot_velocity[0]] = 0.6, 0.8, 0.0
-    reading = Reading(qpos, qvel, sensors, np.array([[175.0, 350.0, 0.01, 0.02]]))
+    reading = Reading(qpos, qvel, sensors, np.array([[175.0, 350.0, 0.01, 0.02, 60.0]]))
     return task.step(state, np.full((1, 10), 0.1), reading, np.full((1, task.step_uniforms), 0.5), np), state
 
 
