@@ -1,5 +1,6 @@
 """Runs a policy for whole episodes and reports what it can do: `python -m hasrl_jax.evaluate`."""
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -135,8 +136,10 @@ def mean_interval(values: np.ndarray) -> dict[str, float | None]:
     return {"mean": mean, "low": mean - float(half), "high": mean + float(half)}
 
 
-def share_interval(hits: np.ndarray) -> dict[str, float]:
-    """Share of true values and its 95 % Wilson interval."""
+def share_interval(hits: np.ndarray) -> dict[str, float | None]:
+    """Share of true values and its 95 % Wilson interval; None without values."""
+    if len(hits) == 0:
+        return {"mean": None, "low": None, "high": None}
     n, share, z = len(hits), float(np.mean(hits)), 1.96
     centre = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
@@ -144,38 +147,25 @@ def share_interval(hits: np.ndarray) -> dict[str, float]:
 
 
 def evaluate(arguments: list[str]) -> None:
-    """The command: loads a policy, plays, prints and writes the summary.
+    """The command: loads a policy, plays, prints and writes the summary, or a whole scorecard.
 
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy.
     """
-    from hasrl_jax.policies import load_policy_parameters
+    from hasrl_jax.policies import load_baseline, load_policy_parameters
 
-    parser = OneLineParser(
-        prog="python -m hasrl_jax.evaluate",
-        description="Play fixed-seed episodes. Physics and cassie settings can be overridden: "
-        "--cassie.randomize.enabled False",
-        allow_abbrev=False,
-    )
-    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
-    parser.add_argument("--policy", help='a policy file (.npz), or "released"')
-    parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=20.0, help="time limit of an episode")
-    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mean")
-    parser.add_argument("--json", type=Path, help="write the statistics here")
-    known, rest = parser.parse_known_args(arguments)
-    check_number("--episodes", "evaluate.episodes", known.episodes)
-    check_number("--seed", "seed", known.seed)
-    if not 0 < known.seconds <= MAX_SECONDS:
-        raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most {MAX_SECONDS:g}")
-    if known.json:
-        require_writable("--json", known.json)
-    config, parameters = load_policy_parameters(known.run_dir, known.policy)
-    if known.physics == "paper" and config.task == "cassie":
-        config = from_dict({"physics": to_dict(shipped("paper").physics)}, config)
-    config = cli.override_for_policy(config, rest, "evaluate")
+    known, rest = _parse(arguments)
+    trained, parameters = load_policy_parameters(known.run_dir, known.policy)
+    if known.scorecard:
+        from hasrl_jax import scorecard
+
+        name = "the released policy" if known.policy == "released" else Path(known.policy or known.run_dir).name
+        policies = {name: (trained, parameters)} | {other: load_baseline(other, trained) for other in known.against}
+        played = {name: (_to_play(config, known, rest), weights) for name, (config, weights) in policies.items()}
+        command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
+        scorecard.write(known.scorecard, played, known.episodes, known.seconds, known.seed, command)
+        return
+    config = _to_play(trained, known, rest)
     env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
     config = from_dict({"collect": {"max_episode_steps": max(1, round(known.seconds / env_step_s))}}, config)
     task = make_task(config)
@@ -186,6 +176,52 @@ def evaluate(arguments: list[str]) -> None:
         print(f"{name:36s} {_readable(value)}")
     if known.json:
         known.json.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _to_play(trained: Config, known: argparse.Namespace, rest: list[str]) -> Config:
+    """The configuration of a policy with the physics to play under and the command line's overrides."""
+    if known.physics == "paper" and trained.task == "cassie":
+        trained = from_dict({"physics": to_dict(shipped("paper").physics)}, trained)
+    return cli.override_for_policy(trained, rest, "evaluate")
+
+
+def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The command line, checked as far as it can be without the policy."""
+    parser = OneLineParser(
+        prog="python -m hasrl_jax.evaluate",
+        description="Play fixed-seed episodes. Physics and cassie settings can be overridden: "
+        "--cassie.randomize.enabled False",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
+    parser.add_argument("--policy", help='a policy file (.npz), or "released"')
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, help="time limit of an episode; default 20, of a scorecard 60")
+    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mean")
+    parser.add_argument("--json", type=Path, help="write the statistics here")
+    parser.add_argument(
+        "--scorecard", type=Path, metavar="DIR", help="speeds, randomisation, pushes and gait, as a page"
+    )
+    parser.add_argument(
+        "--against", nargs="*", default=[], help='more policies for the scorecard: "zero", "random", run directories'
+    )
+    known, rest = parser.parse_known_args(arguments)
+    check_number("--episodes", "evaluate.episodes", known.episodes)
+    check_number("--seed", "seed", known.seed)
+    if known.seconds is None:
+        known.seconds = 60.0 if known.scorecard else 20.0
+    if not 0 < known.seconds <= MAX_SECONDS:
+        raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most {MAX_SECONDS:g}")
+    if known.json:
+        require_writable("--json", known.json)
+    for option in ("json", "stochastic"):
+        if known.scorecard and getattr(known, option):
+            raise ConfigError(f"--scorecard: writes its own files of the mean action; leave out --{option}")
+    if known.against and not known.scorecard:
+        raise ConfigError("--against: only a --scorecard compares policies")
+    return known, rest
 
 
 def _readable(value: Any) -> str:

@@ -39,6 +39,26 @@ def load_policy_parameters(
     return _from_file(RELEASED if str(policy) == "released" else Path(policy))
 
 
+def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray]]:
+    """A policy to compare with: "zero" (the neutral pose for ever), "random" (untrained), a run directory or a file.
+
+    Args:
+      name: which.
+      like: the configuration whose task and network "zero" and "random" take.
+
+    Raises:
+      RunError, CheckpointError: as `load_policy_parameters`.
+    """
+    if name not in ("zero", "random"):
+        return load_policy_parameters(*((name, None) if Path(name).is_dir() else (None, name)))
+    task = make_task(like)
+    learner = ppo.init_learner(like, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    parameters = ppo.export_parameters(learner, like.network.normalize_observations)
+    factor = 0.0 if name == "zero" else 1.0  # without weights and biases the mean action is zero
+    keep = ("policy/log_std", "normalizer/mean", "normalizer/std")
+    return like, {key: array if key in keep else factor * array for key, array in parameters.items()}
+
+
 def policy_metadata(config: Config) -> dict[str, object]:
     """What a released policy file must carry besides its parameters."""
     return {"config": config_module.to_dict(config)}

@@ -1,0 +1,96 @@
+"""The scorecard: its rows, what each row plays, and a small one through the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hasrl_jax import evaluate, scorecard
+from hasrl_jax.config import Config, shipped
+from hasrl_jax.policies import load_baseline
+from hasrl_jax.scorecard import Row
+
+
+def test_rows_cover_what_is_asked() -> None:
+    rows = scorecard.rows()
+    assert len({(row.title, row.randomized) for row in rows}) == len(rows)
+    for randomized in (False, True):
+        speeds = {row.forward_m_s[0] for row in rows if row.kind == "speed" and row.randomized == randomized}
+        assert speeds == {-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0}
+    assert {row.push_n for row in rows if row.kind == "push"} == {50, 100, 150, 200, 250, 300}
+
+
+def test_a_row_sets_the_task_and_keeps_the_policy_s_own_clock() -> None:
+    trained = shipped("paper")
+    config = scorecard.row_config(trained, Row("speed", (1.5, 1.5), randomized=True), 60.0)
+    assert config.cassie.clock == trained.cassie.clock
+    assert config.network == trained.network
+    assert config.cassie.command.forward_m_s == (1.5, 1.5)
+    assert config.cassie.command.resample_s == (0, 0)
+    assert config.cassie.push.force_n == (0, 0)
+    assert config.cassie.termination.min_height_m == 0.6
+    assert config.collect.max_episode_steps == 2400
+    push = scorecard.row_config(trained, Row("push", (1.0, 1.0), push_n=150.0), 60.0)
+    assert push.cassie.push.force_n == (150, 150)
+    assert push.collect.max_episode_steps == 448  # 5 s, up to 1 s more, the push, and 5 s to survive
+
+
+def test_pushed_episodes_are_those_up_at_the_push() -> None:
+    row = Row("push", (1.0, 1.0), push_n=150.0)
+    nothing = np.full(4, np.nan)
+    part = {
+        "seconds": np.array([2.0, 5.5, 11.2, 11.2]),
+        "reached_cap": np.array([False, False, True, True]),
+        "diverged": np.zeros(4, bool),
+        "forward_speed": nothing,
+    }
+    summary = scorecard.summarize_row(row, scorecard.row_config(Config(), row, 60.0), [part])
+    assert summary["pushed_episodes"] == 3
+    np.testing.assert_allclose(summary["share_up"]["mean"], 2 / 3)
+    assert summary["forward_speed"]["mean"] is None
+
+
+def test_a_zero_policy_never_acts() -> None:
+    config, parameters = load_baseline("zero", Config())
+    assert not any(array.any() for name, array in parameters.items() if name.startswith("policy/lstm"))
+    episodes = evaluate.run_episodes(config, scorecard.make_task(config), parameters, 2, 0)
+    assert (episodes.seconds < 3).all()
+    _, random = load_baseline("random", Config())
+    assert random["policy/lstm_0_input"].any()
+
+
+def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = [Row("speed", (0.0, 0.0)), Row("speed", (1.0, 1.0)), Row("push", (1.0, 1.0), push_n=50.0)]
+    few += [Row("speed", (0.0, 0.0), randomized=True)]
+    monkeypatch.setattr(scorecard, "rows", lambda: few)
+    monkeypatch.setattr(scorecard, "BATCH", 2)
+    arguments = ["--policy", "released", "--scorecard", str(tmp_path), "--episodes", "3", "--seconds", "4"]
+    assert evaluate.main([*arguments, "--physics", "training", "--against", "zero"]) == 0
+    report = json.loads((tmp_path / "scorecard.json").read_text())
+    assert list(report["policies"]) == ["the released policy", "zero"]
+    rows = report["policies"]["the released policy"]
+    assert [row["title"] for row in rows] == [row.title for row in few]
+    assert all(row["episodes"] == 3 for row in rows)
+    assert rows[1]["share_up"]["mean"] == 1.0
+    assert 0.8 < rows[1]["forward_speed"]["mean"] < 1.2
+    assert report["policies"]["zero"][0]["share_up"]["mean"] == 0.0
+    page = (tmp_path / "scorecard.md").read_text()
+    assert "| 1 m/s | 100 %" in page
+    assert (tmp_path / "scorecard.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
+        (["--against", "zero"], "--against: only a --scorecard compares policies"),
+        (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
+    ],
+)
+def test_bad_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+    arguments = [str(tmp_path / "card") if argument == "DIR" else argument for argument in arguments]
+    assert evaluate.main(["--policy", "released", *arguments]) != 0
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
