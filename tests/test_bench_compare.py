@@ -8,6 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from hasrl_jax.bench import compare
 from hasrl_jax.bench.__main__ import main
 
 TINY = """
@@ -94,6 +95,18 @@ def test_torch_advantage_stops_where_an_episode_ends() -> None:
     ended = torch.tensor([[False, True, False]])
     advantage = _advantage(torch.tensor([[1.0, 2.0, 4.0]]), ended, 0.5)
     torch.testing.assert_close(advantage, torch.tensor([[2.0, 2.0, 4.0]]))
+
+
+def test_a_peer_is_judged_at_its_best() -> None:
+    def cell(end_to_end: float, collecting: float) -> dict:
+        return {"env_steps_per_second": end_to_end, "collector_per_second": collecting}
+
+    slow, even, quick = cell(1.0, 2.0), cell(3.0, 4.0), cell(2.0, 5.0)
+    assert compare.best([slow, even]) == [even]
+    assert compare.best([slow, even, quick]) == [even, quick]
+    assert compare.best([slow, even, cell(2.0, 4.2)]) == [even]
+    cells = [{"name": "ours", **cell(12.0, 20.0)}, {"name": "torch", **even}, {"name": "torch", **quick}]
+    assert compare.ratios("torch", cells) == {"peer": "torch", "end_to_end": 4.0, "collector": 4.0}
 
 
 def test_missing_packages_are_one_line(
