@@ -41,8 +41,9 @@ def test_arrows(folder: str) -> None:
     assert _own_parts(folder) <= allowed | {"cassie_config", "config", "config_checks", "types"}
 
 
-def test_a_worker_imports_nothing_heavy() -> None:
-    code = "import hasrl_jax.collect.worker, sys; print(*{name.partition('.')[0] for name in sys.modules})"
+@pytest.mark.parametrize("module", ["collect.worker", "envs.gymnasium_env", "bench.compare_peers"])
+def test_a_sub_process_imports_nothing_heavy(module: str) -> None:
+    code = f"import hasrl_jax.{module}, sys; print(*{{name.partition('.')[0] for name in sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert not set(HEAVY) & set(done.stdout.split())
 

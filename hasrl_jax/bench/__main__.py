@@ -15,7 +15,9 @@ from hasrl_jax.bench.report import claim_file, describe_machine
 # name -> (module with the functions of `Bench`, one line for --help); modules load only when they are run
 BENCHES = {
     "collector": ("hasrl_jax.bench.collector", "env steps/s of the CPU pool, and its share of the physics limit"),
+    "scaling": ("hasrl_jax.bench.scaling", "env steps/s by number of workers, and what each worker costs"),
     "learner": ("hasrl_jax.bench.learner", "seconds per PPO update, compile time and recompiles"),
+    "compare": ("hasrl_jax.bench.compare", "ours against stable-baselines3 and a torch PPO on gymnasium"),
     "mjx": ("hasrl_jax.bench.mjx", "physics and environment steps/s of MJX by number of environments"),
     "parity": ("hasrl_jax.bench.parity", "how closely MJX follows C MuJoCo: observations, rewards, terminations"),
 }

@@ -51,19 +51,24 @@ def measure(arguments: argparse.Namespace) -> dict:
     return {"hidden": arguments.hidden, "symmetric": arguments.symmetric, "cells": cells}
 
 
+def with_physics(config: Config, name: str) -> Config:
+    """`config` at one of the physics rates of `PHYSICS`."""
+    timestep_s, steps, iterations, line_search = PHYSICS[name]
+    physics = replace(
+        config.physics,
+        timestep_s=timestep_s,
+        steps_per_env_step=steps,
+        solver_iterations=iterations,
+        line_search_iterations=line_search,
+    )
+    return replace(config, physics=physics)
+
+
 def make_config(arguments: argparse.Namespace, physics: str, num_workers: int) -> Config:
     """The default configuration with one round of the benchmark as an iteration."""
-    config = Config(task=arguments.task)
-    timestep_s, steps, iterations, line_search = PHYSICS[physics]
+    config = with_physics(Config(task=arguments.task), physics)
     return replace(
         config,
-        physics=replace(
-            config.physics,
-            timestep_s=timestep_s,
-            steps_per_env_step=steps,
-            solver_iterations=iterations,
-            line_search_iterations=line_search,
-        ),
         network=replace(config.network, hidden_size=arguments.hidden, symmetric=arguments.symmetric),
         collect=replace(
             config.collect,

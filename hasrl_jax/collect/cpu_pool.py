@@ -141,7 +141,7 @@ class CpuPool:
         self.busy = False
         if not statistics:
             raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
-        return self._merge(statistics)
+        return self.merge(statistics)
 
     def save(self) -> list[bytes]:
         """The state of every worker's environments; only between `finish` and `start`.
@@ -267,8 +267,12 @@ class CpuPool:
             except WorkerError as error:
                 cause = f"was replaced in vain: {error}"
 
-    def _merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
-        """Copies the slots into one buffer and shifts their start and end indices accordingly."""
+    def merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
+        """Copies the slots of the latest iteration into one buffer and shifts their start and end indices.
+
+        Args:
+          statistics: the replies of the workers that finished, by their index.
+        """
         slots = self._block.slots[self._iteration % shared_memory.NUM_BUFFERS]
         finished = [slots[index] for index in sorted(statistics)]
         counts = [int(slot["num_segments"][0]) for slot in finished]

@@ -193,7 +193,7 @@ def _flat(state: EnvState) -> dict[str, np.ndarray]:
 def serve(connection: Connection, descriptor: int) -> None:
     """Answers the pool's messages until it says stop or goes away."""
     setup = json.loads(connection.recv_bytes())
-    _die_with_parent(setup["parent"])
+    die_with_parent(setup["parent"])
     config = config_module.from_dict(setup["config"])
     plan = make_plan(config)
     index = setup["index"]
@@ -225,7 +225,7 @@ def reply(connection: Connection, message: dict) -> None:
     connection.send_bytes(json.dumps(message).encode())
 
 
-def _die_with_parent(parent: int) -> None:
+def die_with_parent(parent: int) -> None:
     """Asks the kernel to end this process with the pool's, however that ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
