@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from hasrl_jax import config as config_module
-from hasrl_jax import config_checks
+from hasrl_jax import config_checks, curriculum
 from hasrl_jax.arguments import OneLineParser
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.config import Config, ConfigError
@@ -48,6 +48,7 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
         else config_module.load_yaml(known.config or config_module.DEFAULT_CONFIG)
     )
     config = override(base, rest, "train")
+    curriculum.stages(config)  # refuses stages that cannot work
     if known.resume:
         config = config_module.from_dict({"run_dir": str(known.resume)}, config)
     return config, known.resume is not None

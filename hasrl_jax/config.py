@@ -122,6 +122,7 @@ class Config:
     schedule: Literal["sync", "overlap"] = "sync"  # collect then train, or collect while training
     seed: int = 0  # seeds every random stream
     total_env_steps: int = 50_000_000  # training ends after this many environment steps
+    stages: tuple[str, ...] = ()  # settings that change on the way, "STEPS FIELD=VALUE ..."; see curriculum.py
     compilation_cache: bool = True  # keep compiled programs in the user's cache directory
     run_dir: str = ""  # where the run is written; empty makes runs/<task>-<time>
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
@@ -176,6 +177,10 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         if value in args:
             return value
         raise ConfigError(f"{path}: got {shown(value)}; expected one of {', '.join(map(repr, args))}")
+    if origin is tuple and args[-1] is Ellipsis:
+        if isinstance(value, list | tuple):
+            return tuple(_convert(v, args[0], f"{path}[{i}]") for i, v in enumerate(value))
+        raise ConfigError(f"{path}: got {shown(value)}; expected a list")
     if origin is tuple:
         if isinstance(value, list | tuple) and len(value) == len(args):
             return tuple(_convert(v, a, f"{path}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
