@@ -35,7 +35,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
     speed.plot(time_s, smooth(measures["forward_speed"], span), color=LINE, label="mean over a gait cycle")
     speed.set_title("forward speed, m/s", loc="left", fontsize=9)
     speed.set_xlim(0, SECONDS_EACH * len(SPEEDS_M_S))
-    speed.legend(fontsize=8, ncols=3, frameon=False, loc="upper left")
+    speed.legend(fontsize=8, ncols=3, frameon=False, loc="lower right")
     for name in TERMS:
         panel, values = panels[name], recording.reward_terms[name]
         weight = config.cassie.reward.scale * getattr(config.cassie.reward, name)
@@ -62,5 +62,5 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
 
 def smooth(values: np.ndarray, span: int) -> np.ndarray:
     """Centred means over `span` steps, over fewer at both ends; [T] -> [T]."""
-    window = np.ones(span)
+    window = np.ones(min(span, len(values)))
     return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")

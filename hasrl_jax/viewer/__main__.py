@@ -10,7 +10,7 @@ from hasrl_jax import cli
 from hasrl_jax.arguments import OneLineParser
 from hasrl_jax.config import ConfigError
 from hasrl_jax.config_checks import check_number
-from hasrl_jax.viewer.browser import Browser
+from hasrl_jax.viewer import browser, native
 from hasrl_jax.viewer.live import Live, Pace
 
 
@@ -26,30 +26,33 @@ def view(arguments: list[str]) -> None:
     check_number("--seed", "seed", known.seed)
     if not 0 <= known.port < 65536:
         raise ConfigError(f"--port: got {known.port}; expected 0 to 65535")
+    if known.native:
+        native.require_display()
+    else:
+        browser.require_viser()
+        browser.free_port(known.port)
     policy = known.policy or (None if known.run_dir else "released")
     config, parameters = load_policy_parameters(known.run_dir, policy)
     config = cli.override_for_policy(paper_physics(config) if known.physics == "paper" else config, rest, "viewer")
     live = Live(config, parameters, known.seed, known.randomized)
     if known.native:
-        from hasrl_jax.viewer import native
-
         native.show(live, known.randomized)
         return
-    browser = Browser(live.model, known.port, known.randomized)
+    page = browser.Browser(live.model, known.port, known.randomized)
     try:
-        print(f"open {browser.url} (this machine only); Ctrl-C ends the viewer", flush=True)
-        loop(live, browser, Pace(), lambda: False)
+        print(f"open {page.url} (this machine only); Ctrl-C ends the viewer", flush=True)
+        loop(live, page, Pace(), lambda: False)
     except KeyboardInterrupt:
         print("ended")
     finally:
-        browser.close()
+        page.close()
 
 
-def loop(live: Live, browser: Browser, pace: Pace, stop: Callable[[], bool]) -> None:
+def loop(live: Live, page: browser.Browser, pace: Pace, stop: Callable[[], bool]) -> None:
     """Simulates in real time until `stop`."""
     while not stop():
-        live.advance(browser.controls())
-        browser.show(live.view(), pace.share())
+        live.advance(page.controls())
+        page.show(live.view(), pace.share())
         time.sleep(pace.wait_s(live.step_s))
 
 

@@ -1,5 +1,7 @@
 """The viewer's page: a panel of controls, the robot, a floor. Served on this machine only."""
 
+import contextlib
+import io
 import math
 import socket
 import threading
@@ -39,11 +41,11 @@ class Browser:
     """
 
     def __init__(self, model: mujoco.MjModel, port: int, randomized: bool = False):
-        try:
-            import viser
-        except ImportError as error:
-            raise ConfigError(f"{MISSING} ({error})") from None
-        self._server = viser.ViserServer(host=HOST, port=free_port(port), label="hasrl_jax", verbose=False)
+        require_viser()
+        import viser
+
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command prints the address
+            self._server = viser.ViserServer(host=HOST, port=free_port(port), label="hasrl_jax", verbose=False)
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self._lock = threading.Lock()  # viser calls back on threads of its own
         self._reset, self._push = False, False
@@ -89,7 +91,7 @@ class Browser:
 
     def _build_panel(self, randomized: bool) -> None:
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
+        gui.configure_theme(show_logo=False, show_share_button=False)
         self._readout = gui.add_markdown("")
         with gui.add_folder("Command"):
             self._forward = gui.add_slider("forward m/s", *FORWARD_M_S, step=0.05, initial_value=0.0)
@@ -149,6 +151,18 @@ class Browser:
             half = math.radians(view.push.direction_deg) / 2
             self._arrow.position = pelvis
             self._arrow.wxyz = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+def require_viser() -> None:
+    """Says what is missing.
+
+    Raises:
+      ConfigError: viser cannot be imported.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(f"{MISSING} ({error})") from None
 
 
 def free_port(port: int) -> int:

@@ -49,14 +49,23 @@ class Keys:
         return held._replace(reset=reset, push=push)
 
 
+def require_display() -> None:
+    """Says what is missing.
+
+    Raises:
+      ConfigError: there is nothing to open a window on.
+    """
+    if platform.system() == "Linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError("--native: needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set")
+
+
 def show(live: Live, randomized: bool) -> None:
     """Opens the window and simulates until it is closed.
 
     Raises:
       ConfigError: no window can be opened here.
     """
-    if platform.system() == "Linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError("--native: needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set")
+    require_display()
     from mujoco import viewer
 
     keys, pace, data = Keys(randomized), Pace(), mujoco.MjData(live.model)
