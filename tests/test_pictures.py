@@ -54,8 +54,8 @@ def test_the_window_starts_with_a_cycle_and_says_who_stands() -> None:
     assert recording.measures["phase"][shown][0] == 0
     assert recording.time_s[shown][0] > gait.SETTLE_S
     assert len(recording.time_s[shown]) == round(gait.SHOWN_S / 0.025)
-    assert gait.contacts(recording.measures["right_force"][:60]) == [(8, 24), (32, 48), (56, 60)]
-    assert gait.contacts(np.zeros(5)) == []
+    assert gait.stretches(recording.measures["right_force"][:60] > 0) == [(8, 24), (32, 48), (56, 60)]
+    assert gait.stretches(np.zeros(5, bool)) == []
     assert gait.title(1.0, recording, slice(0, 240)) == (
         "commanded 1 m/s, walks 0.90 m/s; both feet down 33 %, none 0 %"
     )

@@ -7,6 +7,7 @@ import numpy as np
 from hasrl_jax.collect.numpy_policy import Parameters
 from hasrl_jax.config import Config
 from hasrl_jax.envs import clock
+from hasrl_jax.gait import contacts
 from hasrl_jax.pictures.record import Recording, record
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 SPEEDS_M_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 SETTLE_S = 4.0  # before the part that is shown
 SHOWN_S = 2.0
-CONTACT_N = 15.0  # mean ground force above which a foot counts as on the ground: 5 % of the weight
 SWING = -0.5  # the clock asks a foot to swing where its force clock is below
 LEFT, RIGHT, CLOCK = "#1f6f8b", "#d97706", "#e5e0d5"
 
@@ -51,9 +51,9 @@ def window(recording: Recording) -> slice:
     return slice(first, first + int(np.searchsorted(time_s - time_s[0], SHOWN_S)))
 
 
-def contacts(force: np.ndarray) -> list[tuple[int, int]]:
-    """First and past-the-last index of every stretch in which a foot bears weight. `force`: [T] N."""
-    on = np.concatenate([[False], force > CONTACT_N, [False]])
+def stretches(contact: np.ndarray) -> list[tuple[int, int]]:
+    """First and past-the-last index of every stretch in which a foot stands. `contact`: [T] bool."""
+    on = np.concatenate([[False], contact, [False]])
     edges = np.flatnonzero(on[1:] != on[:-1]).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
@@ -74,7 +74,7 @@ def draw_contacts(axes: "Axes", recording: Recording, shown: slice, config: Conf
     for foot, (name, color, lane) in enumerate((("left_force", LEFT, 1), ("right_force", RIGHT, 0))):
         swings = asked[:, foot] < SWING
         axes.fill_between(time_s, lane - 0.5, lane + 0.5, where=swings.tolist(), color=CLOCK, linewidth=0)
-        bars = [(start * step_s, (end - start) * step_s) for start, end in contacts(measures[name])]
+        bars = [(start * step_s, (end - start) * step_s) for start, end in stretches(contacts(measures[name]))]
         axes.broken_barh(bars, (lane - 0.25, 0.5), color=color)
 
 
@@ -95,7 +95,7 @@ def title(speed: float, recording: Recording, shown: slice) -> str:
     if not len(recording.time_s[shown]):
         return f"commanded {speed:g} m/s: fell after {recording.time_s[-1]:.1f} s"
     measured = recording.measures["forward_speed"][shown].mean()
-    left, right = (recording.measures[name][shown] > CONTACT_N for name in ("left_force", "right_force"))
+    left, right = (contacts(recording.measures[name][shown]) for name in ("left_force", "right_force"))
     both, none = 100 * (left & right).mean(), 100 * (~left & ~right).mean()
     return f"commanded {speed:g} m/s, walks {measured:.2f} m/s; both feet down {both:.0f} %, none {none:.0f} %"
 
