@@ -221,7 +221,10 @@ def test_without_viser_one_line_says_what_to_install(
         (["--prt", "1"], "--prt"),
     ],
 )
-def test_bad_arguments_are_one_line(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_arguments_are_one_line(
+    arguments: list[str], named: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(browser, "require_viser", lambda: None)
     try:
         status = viewer.main(arguments)
     except SystemExit as stopped:

@@ -61,6 +61,9 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
 
 
 def smooth(values: np.ndarray, span: int) -> np.ndarray:
-    """Centred means over `span` steps, over fewer at both ends; [T] -> [T]."""
-    window = np.ones(min(span, len(values)))
-    return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
+    """Centred means over `span` steps; NaN where fewer are left, at both ends. [T] -> [T]"""
+    means = np.full(len(values), np.nan)
+    if len(values) >= span:
+        first = (span - 1) // 2
+        means[first : first + len(values) - span + 1] = np.convolve(values, np.ones(span) / span, "valid")
+    return means
