@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax import cli
+from hasrl_jax.acting import act, start
 from hasrl_jax.arguments import OneLineParser, require_writable
 from hasrl_jax.collect import numpy_policy
-from hasrl_jax.config import Config, ConfigError, from_dict, shipped, to_dict
+from hasrl_jax.config import Config, ConfigError, from_dict
 from hasrl_jax.config_checks import check_number
 from hasrl_jax.envs.cpu_env import CpuEnvs
 from hasrl_jax.envs.registry import make_task
@@ -50,20 +51,18 @@ def run_episodes(
       seed: one number or several; the same seed gives the same episodes.
       mean_action: act without exploration noise.
     """
-    mirror = task.mirror if config.network.symmetric else None
+    acting = start(config, task, parameters, episodes)
     cap = config.collect.max_episode_steps
     envs = CpuEnvs(task, episodes, cap)
     rng = np.random.Generator(np.random.Philox(seed))
     state = envs.reset(rng)
-    carry = np.zeros((episodes, *config.network.carry_shape), np.float32)
-    std = np.exp(numpy_policy.log_std(parameters, mirror))
+    std = np.exp(numpy_policy.log_std(parameters, acting.mirror))
     env_step_s = state.model_fields.get("timestep", task.model.opt.timestep) * task.steps_per_env_step
     total, length = np.zeros(episodes), np.zeros(episodes, np.int64)
     reached_cap, diverged, running = np.zeros(episodes, bool), np.zeros(episodes, bool), np.ones(episodes, bool)
     measures = []
     for _ in range(cap):
-        inputs = numpy_policy.streams(state.observation, parameters, mirror)
-        action, carry = numpy_policy.policy_step(parameters, inputs, carry, state.is_first, mirror)
+        action, acting = act(acting, state.observation, state.is_first)
         if not mean_action:
             action = action + std * rng.standard_normal(action.shape, np.float32)
         state, result = envs.step(state, action, rng)
@@ -180,9 +179,9 @@ def evaluate(arguments: list[str]) -> None:
 
 def _to_play(trained: Config, known: argparse.Namespace, rest: list[str]) -> Config:
     """The configuration of a policy with the physics to play under and the command line's overrides."""
-    if known.physics == "paper" and trained.task == "cassie":
-        trained = from_dict({"physics": to_dict(shipped("paper").physics)}, trained)
-    return cli.override_for_policy(trained, rest, "evaluate")
+    from hasrl_jax.policies import paper_physics
+
+    return cli.override_for_policy(paper_physics(trained) if known.physics == "paper" else trained, rest, "evaluate")
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:

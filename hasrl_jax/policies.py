@@ -59,6 +59,13 @@ def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray
     return like, {key: array if key in keep else factor * array for key, array in parameters.items()}
 
 
+def paper_physics(config: Config) -> Config:
+    """`config` with the walking task at the paper's 2 kHz physics; another task as it is."""
+    if config.task != "cassie":
+        return config
+    return config_module.from_dict({"physics": config_module.to_dict(config_module.shipped("paper").physics)}, config)
+
+
 def policy_metadata(config: Config) -> dict[str, object]:
     """What a released policy file must carry besides its parameters."""
     return {"config": config_module.to_dict(config)}

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,7 +46,25 @@ class Push(NamedTuple):
     at_s: float  # when it starts, since the start of the film
 
 
-def play(env: "TaskEnv", parameters: dict[str, np.ndarray], frames: int, seed: int, push: Push) -> Iterator[Moment]:
+class Speeds(NamedTuple):
+    """Commanded speeds, each for an equal share of the film."""
+
+    forward_m_s: list[float]
+    lateral_m_s: float
+
+    def at(self, frame: int, frames: int) -> float:
+        """The forward speed of a frame out of `frames`."""
+        return self.forward_m_s[frame * len(self.forward_m_s) // frames]
+
+
+def play(
+    env: "TaskEnv",
+    parameters: dict[str, np.ndarray],
+    frames: int,
+    seed: int,
+    push: Push,
+    speeds: Speeds | None = None,
+) -> Iterator[Moment]:
     """Acts with the policy's mean action, one moment per environment step; an episode that ends is followed by another.
 
     Args:
@@ -55,27 +73,27 @@ def play(env: "TaskEnv", parameters: dict[str, np.ndarray], frames: int, seed: i
       frames: environment steps to film.
       seed: of the environment.
       push: a force of 0 does nothing.
+      speeds: commanded one after the other; None leaves the commands to the task.
     """
-    from hasrl_jax.collect import numpy_policy
+    from hasrl_jax.acting import act, start
 
-    mirror = env.task.mirror if env.config.network.symmetric else None
-    carry = np.zeros((1, *env.config.network.carry_shape), np.float32)
+    acting = start(env.config, env.task, parameters, 1)
     env_step_s = env.task.env_step_s
-    recent: deque[list[float]] = deque(maxlen=max(1, round(SPEED_AVERAGE_S / env_step_s)))
+    recent: deque[list[float]] = deque(maxlen=round(SPEED_AVERAGE_S / env_step_s) or 1)
     observation, _ = env.reset(seed=seed)
     is_first, falls = True, 0
     for frame in range(frames):
         time_s = frame * env_step_s
+        if speeds and (is_first or speeds.at(frame - 1, frames) != speeds.at(frame, frames)):
+            observation = env.set_command(speeds.at(frame, frames), speeds.lateral_m_s)
         pushed = push.force_n != 0 and push.at_s <= time_s < push.at_s + PUSH_S
         if pushed:
             env.push(0.0, push.force_n * env_step_s)
-        means = np.mean(recent, axis=0).tolist() if recent else []
         image = env.render()
         assert image is not None
-        yield Moment(image, time_s, dict(zip(env.task.measures, means, strict=False)), falls, pushed)
+        yield Moment(image, time_s, recent_means(env.task.measures, recent), falls, pushed)
 
-        inputs = numpy_policy.streams(observation[None], parameters, mirror)
-        action, carry = numpy_policy.policy_step(parameters, inputs, carry, np.array([is_first]), mirror)
+        action, acting = act(acting, observation[None], np.array([is_first]))
         observation, _, terminated, truncated, info = env.step(action[0])
         recent.append([info[name] for name in env.task.measures])
         is_first = terminated or truncated
@@ -83,6 +101,14 @@ def play(env: "TaskEnv", parameters: dict[str, np.ndarray], frames: int, seed: i
             observation, _ = env.reset()
             recent.clear()
             falls += 1
+
+
+def recent_means(names: tuple[str, ...], recent: Sequence[list[float]]) -> dict[str, float]:
+    """The mean of each measure over the rows of `recent`, but the last value of a command; nothing without rows."""
+    if not recent:
+        return {}
+    means = zip(names, np.mean(recent, axis=0).tolist(), recent[-1], strict=True)
+    return {name: last if name.endswith("_command") else mean for name, mean, last in means}
 
 
 def caption(moment: Moment) -> str:
@@ -162,21 +188,22 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     try:
         frames = max(1, round(known.seconds / env.task.env_step_s))
         push = Push(known.push, known.push_at)
-        falls = film(env, play(env, parameters, frames, known.seed, push), frames, known.out, strip)
+        speeds = Speeds(known.speeds, known.lateral or 0.0) if known.speeds else None
+        falls = film(env, play(env, parameters, frames, known.seed, push, speeds), frames, known.out, strip)
     finally:
         env.close()
     print(f"{known.out} and {strip}: {frames} frames, {known.seconds:g} s, {falls} falls")
 
 
 def _config_to_film(config: "Config", known: argparse.Namespace) -> "Config":
-    """The nominal robot, so that the film runs in real time, the commands asked for, and no time limit."""
+    """The nominal robot, so that the film runs in real time, what was asked for and nothing else, and no time limit."""
     from hasrl_jax.config import from_dict
-    from hasrl_jax.envs.gymnasium_env import fixed_command
+    from hasrl_jax.envs.gymnasium_env import fixed_command, undisturbed
 
     env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
     cap = max(1, round(known.seconds / env_step_s)) + 1
-    changes = {"cassie": {"randomize": {"enabled": False}}, "collect": {"max_episode_steps": cap}}
-    return fixed_command(from_dict(changes, config), known.forward, known.lateral)
+    config = undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
+    return fixed_command(config, known.forward, known.lateral)
 
 
 def _strip(known: argparse.Namespace) -> Path:
@@ -191,13 +218,17 @@ def _check(known: argparse.Namespace) -> None:
         value = getattr(known, name)
         if not 64 <= value <= 4096 or value % 2:
             raise ConfigError(f"--{name}: got {value}; expected an even number from 64 to 4096")
-    for name in ("forward", "lateral", "push", "push_at"):
+    if known.speeds and known.forward is not None:
+        raise ConfigError("--speeds and --forward: give only one of them")
+    for name in ("forward", "lateral", "push", "push_at", "speeds"):
         value = getattr(known, name)
-        if value is not None and not np.isfinite(value):
-            raise ConfigError(f"--{name.replace('_', '-')}: got {value}; expected a finite number")
+        if value is not None and not np.isfinite(value).all():
+            raise ConfigError(f"--{name.replace('_', '-')}: got {value}; expected finite numbers")
     if not 0 < known.seconds <= 3600:
         raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most 3600")
     check_number("--seed", "seed", known.seed)
+    if known.speeds:
+        check_number("--speeds", "cassie.command.forward_m_s", (min(known.speeds), max(known.speeds)))
     for name, path, suffix in (("--out", known.out, ".mp4"), ("--strip", _strip(known), ".png")):
         if path.suffix.lower() != suffix:
             raise ConfigError(f"{name}: got {path}; expected a name that ends in {suffix}")
@@ -217,6 +248,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--forward", type=float, help="commanded forward speed, m/s")
+    parser.add_argument("--speeds", type=float, nargs="+", help="instead: several, each for an equal share of the film")
     parser.add_argument("--lateral", type=float, help="commanded speed to the left, m/s")
     parser.add_argument("--push", type=float, default=0.0, help=f"force to the left for {PUSH_S} s, N")
     parser.add_argument("--push-at", type=float, default=3.0, help="when the push starts, s")

@@ -15,6 +15,7 @@ from PIL import Image
 from hasrl_jax import checkpoint, opengl, policies, render
 from hasrl_jax.checkpoint import CheckpointError
 from hasrl_jax.config import ConfigError, from_dict
+from hasrl_jax.envs.gymnasium_env import TaskEnv
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 from hasrl_jax.run_directory import open_run
@@ -59,6 +60,16 @@ def test_writes_a_film_and_a_strip(policy: Path, tmp_path: Path) -> None:
     assert images.std(axis=(1, 2, 3)).min() > 10  # a scene, not one colour
     strip = np.asarray(Image.open(out.with_suffix(".png")))
     assert strip.shape == (render.STRIP_HEIGHT_PX, render.STRIP_FRAMES * render.STRIP_HEIGHT_PX, 3)
+
+
+def test_speeds_follow_each_other(policy: Path) -> None:
+    config, parameters = policies.load_policy_parameters(None, policy)
+    env = TaskEnv(from_dict({"cassie": {"command": {"resample_s": [0.1, 0.1]}}}, config), "rgb_array")
+    env.render = lambda: np.zeros((2, 2, 3), np.uint8)
+    frames, speeds = 12, render.Speeds([0.5, 0.0, 1.5], 0.1)
+    moments = list(render.play(env, parameters, frames, 0, render.Push(0.0, 0.0), speeds))
+    commands = [(m.measures["forward_command"], m.measures["lateral_command"]) for m in moments[1:]]
+    assert commands == [(speed, 0.1) for speed in [*[0.5] * 4, *[0.0] * 4, *[1.5] * 3]]
 
 
 def test_rgb_array_follows_the_robot() -> None:
@@ -126,6 +137,9 @@ def test_caption() -> None:
         (["--push", "inf"], "--push"),
         (["--seed", "-1"], "--seed"),
         (["--out", "film.gif"], "--out"),
+        (["--speeds", "0", "nan"], "--speeds"),
+        (["--speeds", "0", "11"], "--speeds"),
+        (["--speeds", "1", "--forward", "1"], "--forward"),
         ([], "--run-dir"),
     ],
 )

@@ -206,6 +206,12 @@ def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, 
     return xp.concatenate(parts, axis=-1)
 
 
+def with_command(state: CassieState, observation: Array, command: Array, xp: Any) -> tuple[CassieState, Array]:
+    """`state` and `observation` [..., 50] under `command` [..., 2] (m/s) until the end of the episode."""
+    state = state._replace(command=command, command_s=xp.full_like(state.command_s, xp.inf))
+    return state, xp.concatenate([observation[..., :-2], command], axis=-1)
+
+
 def reward_errors(
     constants: Constants,
     state: CassieState,

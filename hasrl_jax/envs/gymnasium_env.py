@@ -14,6 +14,7 @@ import numpy as np
 from hasrl_jax import config as config_module
 from hasrl_jax import config_checks
 from hasrl_jax.config import Config, ConfigError
+from hasrl_jax.envs import cassie
 from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
@@ -52,6 +53,11 @@ def fixed_command(config: Config, forward: float | None = None, lateral: float |
     if forward is not None and lateral is not None:
         command["resample_s"] = [0.0, 0.0]
     return config_module.from_dict({"cassie": {"command": command}}, config)
+
+
+def undisturbed(config: Config) -> Config:
+    """`config` with the nominal robot and no pushes but those that are asked for."""
+    return config_module.from_dict({"cassie": {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}}, config)
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -161,7 +167,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._renderer is None:
             self._renderer = self._make_renderer()
         renderer, data = self._renderer, self._render_data
-        data.qpos[:] = self._physics[1 : 1 + renderer.model.nq]
+        data.qpos[:] = self.qpos
         mujoco.mj_forward(renderer.model, data)
         renderer.update_scene(data, self._camera)
         return renderer.render()
@@ -189,6 +195,37 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         physics[0, velocity : velocity + 2] += np.array([forward_n_s, lateral_n_s]) / mass
         self._state = self._state._replace(physics=physics)
 
+    def set_command(self, forward_m_s: float, lateral_m_s: float) -> np.ndarray:
+        """Commands Cassie these speeds from now to the end of the episode.
+
+        Returns:
+          The observation to act on: the last one, with the new command.
+
+        Raises:
+          ConfigError: speeds that are not finite or out of limits, or a task without commands.
+          RuntimeError: no episode is running.
+        """
+        self._commanded((forward_m_s, lateral_m_s))
+        if self._state is None or self._ended:
+            raise RuntimeError("no episode is running: call reset() first")
+        command = np.array([[forward_m_s, lateral_m_s]], np.float64)
+        task_state, observation = cassie.with_command(self._state.task, self._state.observation, command, np)
+        self._state = self._state._replace(task=task_state, observation=observation)
+        self._observation = observation[0].astype(np.float32)
+        return self._observation.copy()
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Positions [nq] of the running episode; after its end, those before its last environment step."""
+        return self._physics[1 : 1 + self.task.model.nq]
+
+    @property
+    def step_s(self) -> float:
+        """Duration of an environment step of this episode, s: a randomised robot has its own."""
+        fields = self._state.model_fields if self._state else {}
+        timestep = fields["timestep"][0] if "timestep" in fields else self.task.model.opt.timestep
+        return float(timestep) * self.task.steps_per_env_step
+
     def _open(self, config: Config) -> None:
         self._running = config
         self.task: Task = make_task(config)
@@ -198,13 +235,15 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         unknown = set(options) - {"command"}
         if unknown:
             raise ValueError(f"options: unknown {sorted(unknown)}; known is 'command'")
-        if "command" not in options:
-            return self.config
+        return self._commanded(options["command"]) if "command" in options else self.config
+
+    def _commanded(self, speeds: Any) -> Config:
+        """The configuration that holds the commanded speeds at these two, checked."""
         if self.task.name != "cassie":
-            raise ValueError(f"options['command']: task {self.task.name!r} takes no command")
-        command = np.asarray(options["command"], np.float64)
+            raise ConfigError(f"command: task {self.task.name!r} takes no command")
+        command = np.asarray(speeds, np.float64)
         if command.shape != (2,) or not np.isfinite(command).all():
-            raise ValueError(f"options['command']: got {options['command']!r}; expected two finite speeds in m/s")
+            raise ConfigError(f"command: got {speeds!r}; expected two finite speeds in m/s")
         config = fixed_command(self.config, *command.tolist())
         config_checks.check(config)
         return config

@@ -74,6 +74,54 @@ def test_fixed_command() -> None:
     assert len(set(drawn)) > 1  # the option held for its own episode only
 
 
+def test_a_command_can_change_within_an_episode() -> None:
+    env = make("cassie", from_dict({"cassie": {"command": {"resample_s": [0.05, 0.05]}}}))
+    before, _ = env.reset(seed=0)
+    observation = env.set_command(0.8, -0.05)
+    np.testing.assert_array_equal(observation[:48], before[:48])
+    np.testing.assert_allclose(observation[48:], [0.8, -0.05], rtol=1e-6)
+    for _ in range(6):  # longer than a drawn command lasts
+        observation, *_, info = env.step(np.zeros(10, np.float32))
+        np.testing.assert_allclose(observation[48:], [0.8, -0.05], rtol=1e-6)
+        assert (info["forward_command"], info["lateral_command"]) == (0.8, -0.05)
+    env.set_command(-0.3, 0.0)
+    assert env.step(np.zeros(10, np.float32))[4]["forward_command"] == -0.3
+    fixed = make("cassie", env.config)
+    fixed.reset(seed=0, options={"command": (0.8, -0.05)})
+    again = make("cassie", env.config)
+    again.reset(seed=0)
+    again.set_command(0.8, -0.05)
+    for _ in range(3):  # the same as a command that held from the start
+        ours, theirs = again.step(np.zeros(10)), fixed.step(np.zeros(10))
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        assert ours[1] == theirs[1]
+
+
+def test_impossible_commands_are_refused() -> None:
+    env = make("cassie")
+    with pytest.raises(RuntimeError, match="reset"):
+        env.set_command(0.0, 0.0)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match="finite"):
+        env.set_command(float("nan"), 0.0)
+    with pytest.raises(ConfigError, match="forward_m_s"):
+        env.set_command(11.0, 0.0)
+    pole = make("cartpole")
+    pole.reset(seed=0)
+    with pytest.raises(ConfigError, match="cartpole"):
+        pole.set_command(0.0, 0.0)
+
+
+def test_a_randomised_robot_reports_its_step_and_pose() -> None:
+    env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": True}}}))
+    env.reset(seed=0)
+    assert env.step_s != env.task.env_step_s
+    before = env._state.physics[0, 0]
+    env.step(np.zeros(10))
+    assert env._state.physics[0, 0] - before == pytest.approx(env.step_s)
+    np.testing.assert_array_equal(env.qpos, env._state.physics[0, 1 : 1 + env.task.model.nq])
+
+
 def test_the_time_limit_truncates() -> None:
     env = make("cartpole", from_dict({"collect": {"max_episode_steps": 3}}))
     env.reset(seed=0)
