@@ -108,7 +108,6 @@ class DecoupledConfig:
     max_lag: int = 4  # versions; trajectories of older parameters are dropped
     replay_ratio: float = 1.0  # updates a trajectory may enter on average; above 1, the newest ones again while waiting
     max_importance: float = 2.0  # importance weights of stale steps are cut off here
-    correction: str = "proximal"
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ class CheckpointConfig:
 class Config:
     task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
     backend: Literal["cpu_pool", "mjx"] = "cpu_pool"  # collect in CPU processes, or on the accelerator
-    schedule: Literal["sync", "overlap", "decoupled"] = "sync"  # collect then train, collect one ahead, or independently
+    schedule: Literal["sync", "overlap", "decoupled"] = "sync"  # collect, then train; collect one ahead; independently
     seed: int = 0  # seeds every random stream
     total_env_steps: int = 50_000_000  # training ends after this many environment steps
     compilation_cache: bool = True  # keep compiled programs in the user's cache directory
@@ -140,7 +139,7 @@ class Config:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     decoupled: DecoupledConfig = field(default_factory=DecoupledConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
-    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)  # stays the last: it shows a file is whole
 
 
 def to_dict(config: Any) -> dict[str, Any]:

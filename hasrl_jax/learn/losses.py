@@ -110,43 +110,22 @@ def correct_for_lag(
     return batch._replace(proximal_log_prob=proximal_log_prob, importance=importance), metrics
 
 
-def vtrace_for_lag(batch, params, policy, value_params, value, mean, std, version, ppo):
-    steps = batch.trajectory
-    recomputed = _log_prob(params, policy, steps, mean, std)
-    stale = steps.mask & (steps.policy_version != version)[:, None]
-    rho = jnp.where(stale, jnp.exp(jnp.clip(recomputed - steps.log_prob, -_MAX_LOG_RATIO, 0.0)), 1.0)
-    now = networks.values(value, value_params, steps.observation, mean, std)
-    v = jnp.where(stale, now, steps.value)
-    decay = ppo.discount * ppo.gae_lambda
-    mask = steps.mask
-    v = jnp.where(mask, v, 0.0)
-    following = jnp.pad(v[:, 1:], ((0, 0), (0, 1)))
-    next_value = jnp.where(steps.terminated, 0.0, jnp.where(steps.truncated, steps.bootstrap_value, following))
-    delta = jnp.where(mask, rho * (steps.reward + ppo.discount * next_value - v), 0.0)
-    factor = jnp.where(mask & ~steps.terminated & ~steps.truncated, decay * rho, 0.0)
-
-    def step(later, inputs):
-        delta_t, factor_t = inputs
-        x = delta_t + factor_t * later
-        return x, x
-
-    _, x = jax.lax.scan(step, jnp.zeros_like(delta[:, 0]), (delta.T, factor.T), reverse=True)
-    x = x.T
-    target = x + v
-    advantage = returns.masked_standardize(x, mask) if ppo.standardize_advantages else x
-    proximal_log_prob = jnp.where(stale, recomputed, steps.log_prob)
-    batch = batch._replace(advantage=advantage, target=jnp.where(mask, target, 0.0), proximal_log_prob=proximal_log_prob)
-    return batch, {"importance_mean": returns.masked_mean(rho, mask)}
-
-
 def policy_lag(trajectory: Trajectory, version: jax.Array) -> Metrics:
-    """How many versions older the parameters that acted are than `version`, over the trajectories with a valid step."""
+    """How many versions older than `version` the parameters were that acted, over trajectories with a valid step.
+
+    Args:
+      trajectory: [B, T, ...].
+      version: [] int32, of the learner's parameters.
+
+    Returns:
+      {"policy_lag" (the mean), "policy_lag_min", "policy_lag_max"}.
+    """
     valid = jnp.any(trajectory.mask, axis=1)
     lag = version - trajectory.policy_version
     return {
-        "policy_lag": jnp.sum(jnp.where(valid, lag, 0)) / jnp.maximum(jnp.sum(valid), 1),
-        "policy_lag_min": jnp.min(jnp.where(valid, lag, 2**31 - 1)).astype(jnp.float32),
-        "policy_lag_max": jnp.max(jnp.where(valid, lag, -1)).astype(jnp.float32),
+        "policy_lag": returns.masked_mean(lag, valid),
+        "policy_lag_min": jnp.min(lag, where=valid, initial=2**31 - 1).astype(jnp.float32),
+        "policy_lag_max": jnp.max(lag, where=valid, initial=-1).astype(jnp.float32),
     }
 
 
@@ -166,7 +145,8 @@ def policy_loss(
         ratio_t = exp(log pi(a_t | s_t) - proximal log-prob)
         loss = -E_t[importance_t min(ratio_t A_t, clip(ratio_t, 1 - clip, 1 + clip) A_t)] - c1 H
 
-    The proximal log-probability is the behaviour's and the importance 1 unless `correct_for_lag` says otherwise. E_t averages over `batch.weight`; the approximate KL, E[(ratio - 1) - log ratio], and the clip fraction always
+    The proximal log-prob is the behaviour's and the importance 1, unless `correct_for_lag` made them otherwise.
+    E_t averages over `batch.weight`; the approximate KL, E[(ratio - 1) - log ratio], and the clip fraction always
     average over valid steps only.
 
     Args:

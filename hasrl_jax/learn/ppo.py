@@ -25,7 +25,6 @@ from hasrl_jax.learn.losses import (
     policy_loss,
     prepare_batch,
     value_loss,
-    vtrace_for_lag,
 )
 from hasrl_jax.learn.networks import Policy, Value, make_networks
 from hasrl_jax.types import Mirror, Trajectory
@@ -44,6 +43,10 @@ _POLICY_METRICS = (
     "policy_updates",
     "policy_gradient_norm",
 )
+
+
+class LearnerError(RuntimeError):
+    """The update failed on its device; the message carries the cause."""
 
 
 class LearnerState(NamedTuple):
@@ -182,17 +185,9 @@ class Update:
         statistics = normalize.mean_std(state.normalizer, config.network.normalize_observations)
         metrics |= policy_lag(trajectory, state.update_count)
         if config.schedule == "decoupled":
-            limit = config.decoupled.max_importance
-            if config.decoupled.correction == "proximal":
-                batch, importance = correct_for_lag(
-                    batch, state.policy_params, self.policy, *statistics, state.update_count, limit
-                )
-                metrics |= importance
-            elif config.decoupled.correction == "vtrace":
-                batch, importance = vtrace_for_lag(
-                    batch, state.policy_params, self.policy, state.value_params, self.value, *statistics, state.update_count, ppo
-                )
-                metrics |= importance
+            acted = state.policy_params, self.policy, *statistics, state.update_count
+            batch, importance = correct_for_lag(batch, *acted, config.decoupled.max_importance)
+            metrics |= importance
         scale = jnp.ones(())
         if ppo.learning_rate_schedule == "linear":
             scale = jnp.maximum(0.0, 1.0 - state.env_steps.astype(jnp.float32) / config.total_env_steps)
