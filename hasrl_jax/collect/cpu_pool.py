@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from hasrl_jax.collect import shared_memory
-from hasrl_jax.collect.buffer import Collected, Part, merge
+from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.config import Config, to_dict
 from hasrl_jax.envs.task import Task
@@ -105,7 +105,7 @@ class CpuPool:
           WorkerError: no worker finished, or one failed too many times in a row.
         """
         pending = set(range(self.plan.num_workers))
-        parts: dict[int, Part] = {}
+        statistics: dict[int, dict[str, Any]] = {}
         cause: str | None = None
         while pending:
             for index, answer in self.answers(pending, timeout_s=1.0).items():
@@ -113,11 +113,14 @@ class CpuPool:
                 if isinstance(answer, str):
                     cause = answer
                 else:
-                    parts[index] = Part(self.slot(index, self._iteration), self._version, answer)
+                    statistics[index] = answer
         self.busy = False
-        if not parts:
+        if not statistics:
             raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
-        return merge([parts[index] for index in sorted(parts)], time.monotonic() - self._started)
+        finished = sorted(statistics)
+        slots = [self.slot(index, self._iteration) for index in finished]
+        ordered = [statistics[index] for index in finished]
+        return merge(slots, ordered, self._version, time.monotonic() - self._started)
 
     def write_parameters(self, copy: int, parameters: dict[str, np.ndarray]) -> None:
         """Fills one of the copies of the parameters in shared memory, which no worker may be using."""

@@ -8,11 +8,11 @@ Source: paper section V, future work.
 
 import threading
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.collect.buffer import Collected, Part, merge
+from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.cpu_pool import CpuPool
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.collect.shared_memory import NUM_BUFFERS
@@ -22,6 +22,15 @@ from hasrl_jax.envs.task import Task
 POLL_SECONDS = 0.01  # between looks for a slot that the learner has freed, or for the first parameters
 ANSWER_SECONDS = 0.1  # the longest wait for answers, and so for the end
 STREAMS_APART = 2**20  # a run resumed an iteration later draws random numbers so many collections later
+
+
+class Finished(NamedTuple):
+    """A slot that a worker has filled."""
+
+    worker: int
+    slot: dict[str, np.ndarray]  # arrays of shared_memory.slot_specs
+    version: int  # of the parameters that acted
+    statistics: dict[str, Any]
 
 
 class Dropped(NamedTuple):
@@ -53,7 +62,7 @@ class FreePool:
         self._at_work: dict[int, int] = {}  # worker -> version it collects with
         self._filled = [0] * plan.num_workers  # slots that each worker has filled since the start
         self._taken = [0] * plan.num_workers  # of these, slots that the learner has taken or dropped
-        self._finished: deque[tuple[int, Part]] = deque()  # (worker, what it collected), oldest first
+        self._finished: deque[Finished] = deque()  # oldest first
         self._closing = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._serve, name="free_pool", daemon=True)
@@ -101,11 +110,11 @@ class FreePool:
                     return None
                 self._changed.wait()
             taken = [self._finished.popleft() for _ in range(self._plan.num_workers)]
-        parts = [part for _, part in taken]
-        collected = merge(parts, float(np.mean([part.statistics["seconds"] for part in parts])))
+        _, slots, versions, statistics = map(list, zip(*taken, strict=True))
+        collected = merge(slots, statistics, versions, float(np.mean([one["seconds"] for one in statistics])))
         with self._changed:
-            for index, _ in taken:
-                self._taken[index] += 1
+            for finished in taken:
+                self._taken[finished.worker] += 1
         return collected
 
     def pop_dropped(self) -> Dropped:
@@ -120,11 +129,12 @@ class FreePool:
         self._pool.close()
 
     def _drop_older_than(self, oldest: int) -> None:
-        for index, part in [finished for finished in self._finished if finished[1].version < oldest]:
-            trajectories, env_steps = int(part.slot["num_segments"][0]), len(part.slot["mask"])
+        """Frees the slots that hold data of older versions than `oldest`."""
+        for finished in [finished for finished in self._finished if finished.version < oldest]:
+            trajectories, env_steps = int(finished.slot["num_segments"][0]), len(finished.slot["mask"])
             self._dropped = Dropped(self._dropped.trajectories + trajectories, self._dropped.env_steps + env_steps)
-            self._taken[index] += 1
-        self._finished = deque(finished for finished in self._finished if finished[1].version >= oldest)
+            self._taken[finished.worker] += 1
+        self._finished = deque(finished for finished in self._finished if finished.version >= oldest)
 
     def _serve(self) -> None:
         """The thread: orders and answers, until the end or an error, which `take` raises."""
@@ -137,7 +147,7 @@ class FreePool:
                         version = self._at_work.pop(index)
                         if not isinstance(answer, str):  # else it was replaced and begins this slot anew
                             slot = self._pool.slot(index, self._stream(index))
-                            self._finished.append((index, Part(slot, version, answer)))
+                            self._finished.append(Finished(index, slot, version, answer))
                             self._filled[index] += 1
                     self._changed.notify_all()
         except BaseException as error:
