@@ -98,6 +98,7 @@ def override_for_policy(trained: Config, arguments: list[str], program: str) -> 
 def run(job: Callable[[], None]) -> int:
     """Runs a command; expected errors become one line on stderr and exit status 1 (2 for a bad configuration)."""
     from hasrl_jax.checkpoint import CheckpointError
+    from hasrl_jax.learn.ppo import LearnerError
     from hasrl_jax.run_directory import RunError
 
     try:
@@ -105,7 +106,7 @@ def run(job: Callable[[], None]) -> int:
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (RunError, CheckpointError, WorkerError, FloatingPointError, OSError) as error:
+    except (RunError, CheckpointError, WorkerError, LearnerError, FloatingPointError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except MemoryError as error:

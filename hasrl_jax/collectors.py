@@ -2,6 +2,7 @@
 
 import io
 import logging
+import math
 import os
 import time
 from pathlib import Path
@@ -12,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hasrl_jax.collect.cpu_pool import Collected, CpuPool
+from hasrl_jax.collect.buffer import Collected
+from hasrl_jax.collect.cpu_pool import CpuPool
+from hasrl_jax.collect.free_pool import FreePool
 from hasrl_jax.collect.mjx import ActingParameters, MjxCollector, Statistics, make_mjx_plan
 from hasrl_jax.collect.plan import Plan, make_plan
 from hasrl_jax.config import Config
@@ -28,12 +31,12 @@ log = logging.getLogger("hasrl_jax")
 
 
 class Experience(NamedTuple):
-    """What one iteration collected."""
+    """What one iteration learns from."""
 
     trajectory: Trajectory  # [B, T, ...]
-    env_steps: int
-    version: int  # of the parameters that acted
+    env_steps: int  # collected since the last one
     record: Record  # metrics of the collection
+    replayed: bool = False  # an earlier iteration learnt from the same trajectories
 
 
 class Collector(Protocol):
@@ -55,7 +58,7 @@ class Collector(Protocol):
         """Waits for what `start` asked for."""
 
     def save(self) -> list[bytes]:
-        """The state of the environments, for a checkpoint; only while not busy."""
+        """The state of the environments, for a checkpoint; empty while they are being stepped."""
 
     def load(self, states: list[bytes]) -> None:
         """Restores what `save` returned."""
@@ -67,7 +70,9 @@ class Collector(Protocol):
 
 def make_collector(config: Config, task: Task, mesh: Mesh) -> Collector:
     """The collector of `config.backend`."""
-    return CpuExperience(config, task) if config.backend == "cpu_pool" else MjxExperience(config, task, mesh)
+    if config.backend == "mjx":
+        return MjxExperience(config, task, mesh)
+    return FreeExperience(config, task) if config.schedule == "decoupled" else CpuExperience(config, task)
 
 
 class CpuExperience:
@@ -98,10 +103,72 @@ class CpuExperience:
     def finish(self) -> Experience:
         collected = self.pool.finish()
         record = cpu_record(collected) | {"workers_lost": self.pool.workers_lost}
-        return Experience(to_trajectory(collected, self.plan), len(collected.fields["mask"]), collected.version, record)
+        return Experience(to_trajectory(collected, self.plan), len(collected.fields["mask"]), record)
 
     def save(self) -> list[bytes]:
-        return self.pool.save()
+        return [] if self.pool.busy else self.pool.save()
+
+    def load(self, states: list[bytes]) -> None:
+        self.pool.load(states)
+
+
+class FreeExperience:
+    """A `FreePool`: what was finished first, and the newest batch once more while there is no other."""
+
+    busy = False  # its workers always are, and `start` only gives them newer parameters
+
+    def __init__(self, config: Config, task: Task):
+        self.config, self.task, self.plan = config, task, make_plan(config)
+        self.normalizes = config.network.normalize_observations
+        slots = f"{self.plan.steps_per_worker} environment steps at a time"
+        envs = f"{self.plan.num_workers} free workers x {self.plan.envs_per_worker} environments"
+        self.description = f"{envs}, {slots}, {self.plan.env_steps} for an iteration"
+        self._version = self._batches = self._uses = self._uses_of_newest = 0
+        self._newest: Experience | None = None
+
+    def __enter__(self) -> "FreeExperience":
+        self.pool = FreePool(self.config, self.plan, self.task)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.pool.close()
+
+    def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
+        self.pool.publish(ppo.export_parameters(learner, self.normalizes), version)
+        self._version = version
+
+    def finish(self) -> Experience:
+        replayable = self._replayable()
+        collected = self.pool.take(self._version, wait=replayable is None)
+        if collected is not None:
+            self._batches, self._uses_of_newest = self._batches + 1, 0
+            env_steps, record = len(collected.fields["mask"]), cpu_record(collected)
+            experience = self._newest = Experience(to_trajectory(collected, self.plan), env_steps, record)
+        elif replayable is not None:
+            unknown: Record = dict.fromkeys(replayable.record)
+            experience = replayable._replace(env_steps=0, record=unknown, replayed=True)
+        self._uses, self._uses_of_newest = self._uses + 1, self._uses_of_newest + 1
+        dropped = self.pool.pop_dropped()
+        counts: Record = {
+            "workers_lost": self.pool.workers_lost,
+            "dropped_stale": dropped.trajectories,
+            "replay_ratio": self._uses / self._batches,
+        }
+        env_steps = experience.env_steps + dropped.env_steps
+        return experience._replace(env_steps=env_steps, record=experience.record | counts)
+
+    def _replayable(self) -> Experience | None:
+        """The newest batch, if it may be used once more."""
+        settings, newest = self.config.decoupled, self._newest
+        within_average = self._uses + 1 <= settings.replay_ratio * self._batches
+        if newest is None or not within_average or self._uses_of_newest >= math.ceil(settings.replay_ratio):
+            return None
+        valid = newest.trajectory.mask.any(axis=1)
+        fresh = self._version - newest.trajectory.policy_version[valid].min(initial=self._version) <= settings.max_lag
+        return newest if fresh else None
+
+    def save(self) -> list[bytes]:
+        return []
 
     def load(self, states: list[bytes]) -> None:
         self.pool.load(states)
@@ -120,7 +187,7 @@ class MjxExperience:
         self.collector = MjxCollector(self.plan, engine, *networks, mesh)
         self.seed = config.seed
         self.normalizes, self.reward_terms = config.network.normalize_observations, task.reward_terms
-        self.busy, self._version, self._started = False, 0, 0.0
+        self.busy, self._started = False, 0.0
         self._pending: Any = None  # between `start` and `finish`
         steps = f"{self.plan.env_steps} environment steps per iteration"
         self.description = f"{self.plan.num_envs} MJX environments ({settings.impl}), {steps}"
@@ -138,7 +205,7 @@ class MjxExperience:
         # Copied, because the update donates the learner's arrays while this program may still read them.
         parameters = jax.tree.map(jnp.copy, ActingParameters(learner.policy_params, learner.value_params, *statistics))
         self._pending = self.collector(parameters, self.state, version)
-        self.busy, self._version, self._started = True, version, time.monotonic()
+        self.busy, self._started = True, time.monotonic()
 
     def finish(self) -> Experience:
         self.state, trajectory, sums = self._pending
@@ -147,9 +214,11 @@ class MjxExperience:
         if not statistics.valid_steps:
             raise FloatingPointError("every MJX environment diverged; the policy's actions are probably not finite")
         record = mjx_record(statistics, self.reward_terms) | {"collect_seconds": time.monotonic() - self._started}
-        return Experience(trajectory, self.plan.env_steps, self._version, record)
+        return Experience(trajectory, self.plan.env_steps, record)
 
     def save(self) -> list[bytes]:
+        if self.busy:
+            return []
         buffer = io.BytesIO()
         np.savez(buffer, *(np.asarray(leaf) for leaf in jax.tree.leaves(self.state)))
         return [buffer.getvalue()]
@@ -169,8 +238,7 @@ class MjxExperience:
 def to_trajectory(collected: Collected, plan: Plan) -> Trajectory:
     """The centralised buffer as trajectories padded on the right, in whole minibatches (paper III.B)."""
     rows = plan.rows * -(-len(collected.start) // plan.rows)
-    version = np.full(len(collected.start), collected.version, np.int32)
-    fields = collected.fields | {"initial_carry": collected.initial_carry, "policy_version": version}
+    fields = collected.fields | {"initial_carry": collected.initial_carry, "policy_version": collected.version}
     return pad_segments(fields, collected.start, collected.end, plan.max_length, rows)
 
 

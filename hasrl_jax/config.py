@@ -104,6 +104,13 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class DecoupledConfig:
+    max_lag: int = 4  # versions; trajectories of older parameters are dropped
+    replay_ratio: float = 1.0  # updates a trajectory may enter on average; above 1, the newest ones again while waiting
+    max_importance: float = 2.0  # importance weights of stale steps are cut off here
+
+
+@dataclass(frozen=True)
 class EvaluateConfig:
     every_iterations: int = 20  # evaluate the mean action every this many iterations; 0 never
     episodes: int = 16  # episodes per evaluation
@@ -119,7 +126,7 @@ class CheckpointConfig:
 class Config:
     task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
     backend: Literal["cpu_pool", "mjx"] = "cpu_pool"  # collect in CPU processes, or on the accelerator
-    schedule: Literal["sync", "overlap"] = "sync"  # collect then train, or collect while training
+    schedule: Literal["sync", "overlap", "decoupled"] = "sync"  # collect, then train; collect one ahead; independently
     seed: int = 0  # seeds every random stream
     total_env_steps: int = 50_000_000  # training ends after this many environment steps
     stages: tuple[str, ...] = ()  # settings that change on the way, "STEPS FIELD=VALUE ..."; see curriculum.py
@@ -131,8 +138,9 @@ class Config:
     collect: CollectConfig = field(default_factory=CollectConfig)
     mjx: MjxConfig = field(default_factory=MjxConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    decoupled: DecoupledConfig = field(default_factory=DecoupledConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
-    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)  # stays the last: it shows a file is whole
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -74,6 +74,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.discount": (0, 1),
     "ppo.gae_lambda": (0, 1),
     "ppo.max_kl": (0, 1e6),
+    "decoupled.max_lag": (0, 10**6),
+    "decoupled.replay_ratio": (1, 100),
+    "decoupled.max_importance": (1, 1e6),
     "evaluate.every_iterations": (0, 10**9),
     "evaluate.episodes": (1, 10**5),
     "checkpoint.every_iterations": (0, 10**9),
@@ -93,6 +96,9 @@ def check(config: Config) -> None:
             value = getattr(value, part)
         check_number(name, name, value)
     _check_cassie(config.cassie)
+    if config.backend != "cpu_pool":
+        devices = f"'sync' or 'overlap' with backend {config.backend}, where collecting and learning share the devices"
+        _require(config.schedule != "decoupled", "schedule", config.schedule, devices)
     if config.task == "cassie" and config.cassie.randomize.enabled:
         scale, timestep_s = config.cassie.randomize.physics_rate_scale, config.physics.timestep_s
         low, high = LIMITS["physics.timestep_s"]

@@ -21,7 +21,7 @@ from hasrl_jax.run_directory import METRICS_FILE, TENSORBOARD_DIRECTORY, RunErro
 
 Record = dict[str, float | int | None]
 
-_COLLECT_METRICS = ("env_steps", "policy_lag", "diverged_envs", "workers_lost")
+_COLLECT_METRICS = ("env_steps", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
 _RATE_WINDOW = 20  # iterations over which the speed behind "time left" is measured
 
 
@@ -103,7 +103,7 @@ def tag(name: str) -> str:
     for group in ("train", "test"):
         if name.endswith(f"_{group}"):
             return f"{group}/{name.removesuffix(f'_{group}')}"
-    return f"collect/{name}" if name in _COLLECT_METRICS else f"learner/{name}"
+    return f"collect/{name}" if name in _COLLECT_METRICS or name.startswith("policy_lag") else f"learner/{name}"
 
 
 class ProgressPrinter:

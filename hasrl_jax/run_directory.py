@@ -80,9 +80,11 @@ def load_run_config(run_dir: Path) -> Config:
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be read: {_reason(error)}") from None
     # A file that was cut short is often still valid YAML; defaults must not quietly take the place of what is missing.
-    missing = [f.name for f in dataclasses.fields(Config) if not isinstance(values, dict) or f.name not in values]
+    # Only the last group tells: others may be younger than the run.
+    last = dataclasses.fields(Config)[-1].name
+    missing = not isinstance(values, dict) or last not in values
     if missing or not text.endswith("\n"):
-        cut = f"{missing[0]} is missing" if missing else "the last line is cut short"
+        cut = f"{last} is missing" if missing else "the last line is cut short"
         raise RunError(f"{path}: damaged, or written by another version: {cut}")
     try:
         config = config_module.from_dict(values, where=CONFIG_FILE)

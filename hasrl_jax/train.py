@@ -4,7 +4,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -14,7 +14,7 @@ import jax
 
 from hasrl_jax import checkpoint, cli
 from hasrl_jax.collect.cpu_pool import WorkerError
-from hasrl_jax.collectors import Collector, make_collector, prepare_jax
+from hasrl_jax.collectors import Collector, Experience, make_collector, prepare_jax
 from hasrl_jax.config import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
@@ -35,12 +35,18 @@ class Progress(NamedTuple):
     seconds: float = 0.0  # spent training
 
 
-def train(config: Config, resume: bool = False) -> None:
-    """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM."""
+def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.Update] = ppo.make_update) -> None:
+    """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM.
+
+    Args:
+      config: the run's configuration.
+      resume: continue the run in `config.run_dir`.
+      make_update: makes the learner's program; benchmarks put another in its place.
+    """
     prepare_jax(config)
     task, mesh = make_task(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
-    update, collector = ppo.make_update(config, *sizes, mesh), make_collector(config, task, mesh)
+    update, collector = make_update(config, *sizes, mesh), make_collector(config, task, mesh)
     with open_run(config, resume) as run, stop_signal() as stop:
         learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
         progress, env_states = Progress(), []
@@ -71,21 +77,17 @@ def train(config: Config, resume: bool = False) -> None:
                     collector.start(learner, progress.iteration + 1, version=progress.iteration)
 
                 update_started = time.monotonic()
-                learner, result = update(learner, experience.trajectory)
-                record: Record = {"iteration": progress.iteration + 1, "env_steps": env_steps, **experience.record}
-                record |= {name: float(value) for name, value in result.items()}  # waits for the update to finish
-                if not record.pop("parameters_finite"):
-                    raise FloatingPointError(
-                        f"iteration {progress.iteration + 1}: the update gave parameters that are not finite, and "
-                        "nothing of it is saved; use --resume with a lower ppo.policy_learning_rate"
-                    )
+                learner, metrics = learn(update, learner, experience, progress.iteration + 1)
                 now = time.monotonic()
-                record |= {
-                    "policy_lag": progress.iteration - experience.version,
+                progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
+                record: Record = {
+                    **{"iteration": progress.iteration, "env_steps": env_steps, "train_seconds": progress.seconds},
+                    **experience.record,
+                    **metrics,
                     "env_steps_per_second": experience.env_steps / (now - started),
+                    "wait_seconds": update_started - started,
                     "update_seconds": now - update_started,
                 }
-                progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
 
                 last = env_steps >= config.total_env_steps
                 if due(progress.iteration, config.evaluate.every_iterations) or last:
@@ -93,10 +95,34 @@ def train(config: Config, resume: bool = False) -> None:
                 writer.write(record)
                 printer.update(record)
                 if due(progress.iteration, config.checkpoint.every_iterations):
-                    save(config, run.checkpoints, progress, learner, [] if collector.busy else collector.save())
+                    save(config, run.checkpoints, progress, learner, collector.save())
             if not due(progress.iteration, config.checkpoint.every_iterations):
-                save(config, run.checkpoints, progress, learner, [] if collector.busy else collector.save())
+                save(config, run.checkpoints, progress, learner, collector.save())
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
+
+
+def learn(
+    update: ppo.Update, learner: ppo.LearnerState, experience: Experience, iteration: int
+) -> tuple[ppo.LearnerState, Record]:
+    """One update, finished when this returns.
+
+    Raises:
+      FloatingPointError: it gave parameters that are not finite.
+      LearnerError: it failed; the donated state is lost.
+    """
+    resume = "nothing of it is saved; use --resume"
+    try:
+        learner, result = update(learner, experience.trajectory, experience.replayed)
+        record: Record = {name: float(value) for name, value in result.items()}  # waits for the update to finish
+    except jax.errors.JaxRuntimeError as error:
+        cause = str(error).partition("\n")[0]
+        raise ppo.LearnerError(f"iteration {iteration}: the update failed ({cause}), and {resume}") from error
+    if not record.pop("parameters_finite"):
+        raise FloatingPointError(
+            f"iteration {iteration}: the update gave parameters that are not finite, and {resume} with a lower "
+            "ppo.policy_learning_rate"
+        )
+    return learner, record
 
 
 def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:

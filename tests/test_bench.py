@@ -74,9 +74,37 @@ def test_mjx_stops_where_the_memory_ends(monkeypatch: pytest.MonkeyPatch, capsys
     assert "64 environments do not fit" in capsys.readouterr().err
 
 
+def test_schedules_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    figures, picture = tmp_path / "schedules.json", tmp_path / "new" / "schedules.png"
+    with open(tiny, "a") as file:
+        file.write("collect: {num_workers: 2, envs_per_worker: 2, max_episode_steps: 20}\n")
+    sizes = ["--total-env-steps", "512", "--env-steps-per-iteration", "128", "--unroll-length", "2"]
+    sizes += ["--seeds", "2", "--iterations", "2", "--update-shares", "1", "--target", "1"]
+    arguments = ["schedules", "--config", tiny, *sizes, "--json", str(figures), "--plot", str(picture)]
+    assert main(arguments) == 0
+    output = capsys.readouterr().out
+    assert "2 of 2" in output and "update s (asleep)" in output
+    written = json.loads(figures.read_text())["figures"]
+    assert [(run["schedule"], run["seed"]) for run in written["runs"][:4]] == [
+        *(("sync", 0), ("overlap", 0), ("decoupled", 0)),
+        ("sync", 1),
+    ]
+    for run in written["runs"]:
+        assert run["curve"][-1]["env_steps"] >= 512
+        assert run["env_steps_to_target"] == 128
+        assert run["policy_lag_max"] <= {"sync": 0, "overlap": 1, "decoupled": 4}[run["schedule"]]
+    cells = {cell["schedule"]: cell for cell in written["hiding"]}
+    assert cells["sync"]["ideal_seconds"] == pytest.approx(2 * cells["overlap"]["ideal_seconds"])
+    with Image.open(picture) as image:
+        assert image.size[0] > image.size[1] > 200
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
+        (["schedules", "--seeds", "0"], "--seeds"),
+        (["schedules", "--update-shares", "-1"], "--update-shares"),
+        (["schedules", "--total-env-steps", "0"], "total_env_steps"),
         (["parity", "--states", "0"], "--states"),
         (["parity", "--horizons", "1", "0"], "--horizons"),
         (["parity", "--seed", "-1"], "--seed"),

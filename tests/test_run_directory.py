@@ -130,6 +130,14 @@ def test_damaged_configuration(tmp_path: Path, damage) -> None:
         load_run_config(tmp_path)
 
 
+def test_a_configuration_from_before_a_setting_existed_is_read(tmp_path: Path) -> None:
+    config = config_for(tmp_path)
+    whole = dump_yaml(config)
+    begin, end = whole.index("decoupled:\n"), whole.index("evaluate:\n")
+    (tmp_path / "config.yaml").write_text(whole[:begin] + whole[end:])
+    assert load_run_config(tmp_path) == config
+
+
 def test_directory_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for name in ("file", "file/run"):

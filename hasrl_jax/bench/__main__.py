@@ -20,6 +20,7 @@ BENCHES = {
     "compare": ("hasrl_jax.bench.compare", "ours against stable-baselines3 and a torch PPO on gymnasium"),
     "mjx": ("hasrl_jax.bench.mjx", "physics and environment steps/s of MJX by number of environments"),
     "parity": ("hasrl_jax.bench.parity", "how closely MJX follows C MuJoCo: observations, rewards, terminations"),
+    "schedules": ("hasrl_jax.bench.schedules", "learning curves by schedule, and what each hides of an iteration"),
 }
 
 

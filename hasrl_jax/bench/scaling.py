@@ -14,6 +14,7 @@ import psutil
 
 from hasrl_jax.bench import collector
 from hasrl_jax.bench.report import format_table
+from hasrl_jax.collect.buffer import merge
 from hasrl_jax.collect.cpu_pool import CpuPool
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.collectors import to_trajectory
@@ -85,7 +86,8 @@ def measure_round(pool: CpuPool, learner: ppo.LearnerState, iteration: int) -> d
     sent = time.perf_counter()
     collected = pool.finish()
     finished = time.perf_counter()
-    again = pool.merge(dict(enumerate(collected.statistics)))
+    slots = [pool.slot(index, iteration) for index in range(len(collected.statistics))]
+    again = merge(slots, collected.statistics, iteration, seconds=0.0)
     merged = time.perf_counter()
     to_trajectory(again, pool.plan)
     return {

@@ -13,12 +13,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from hasrl_jax.collect import shared_memory
+from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.config import Config, to_dict
 from hasrl_jax.envs.task import Task
@@ -30,22 +32,6 @@ MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in betw
 
 class WorkerError(RuntimeError):
     """Workers cannot be started or keep failing; the message carries the cause."""
-
-
-class Collected(NamedTuple):
-    """One iteration's experience: the centralised buffer of the paper.
-
-    `fields` holds flat arrays over the N steps of all workers that finished; trajectory i is the steps
-    `start[i]` to `end[i]`.
-    """
-
-    fields: dict[str, np.ndarray]  # the per-step arrays of shared_memory.slot_specs, [N, ...]
-    start: np.ndarray  # [S] int32, re-based to the centralised buffer
-    end: np.ndarray  # [S] int32
-    initial_carry: np.ndarray  # [S, L, 2, W]
-    version: int  # of the parameters that acted
-    statistics: list[dict[str, Any]]  # one per worker that finished
-    seconds: float  # from the request to the last reply
 
 
 class _Worker(NamedTuple):
@@ -103,14 +89,12 @@ class CpuPool:
           iteration: selects the random streams and, by its parity, the buffers.
           version: of the parameters.
         """
-        buffer = self._block.parameters[iteration % shared_memory.NUM_BUFFERS]
-        for name, array in buffer.items():
-            array[:] = parameters[name]
+        buffer = iteration % shared_memory.NUM_BUFFERS
+        self.write_parameters(buffer, parameters)
         self._iteration, self._version, self._started = iteration, version, time.monotonic()
         self.busy = True
-        self._block.heartbeat[:] = self._started
         for index in range(self.plan.num_workers):
-            self._send(index, {"do": "collect", "iteration": iteration})
+            self.order(index, iteration, buffer)
 
     def finish(self) -> Collected:
         """Waits for the iteration that `start` asked for and merges the workers' buffers.
@@ -124,24 +108,58 @@ class CpuPool:
         statistics: dict[int, dict[str, Any]] = {}
         cause: str | None = None
         while pending:
-            by_connection = {self._workers[index].connection: index for index in pending}
-            for ready in wait(list(by_connection), timeout=1.0):
-                index = by_connection[cast(Connection, ready)]
+            for index, answer in self.answers(pending, timeout_s=1.0).items():
                 pending.discard(index)
-                reply, failure = self._receive(index)
-                if failure is None:
-                    statistics[index] = json.loads(reply)
-                    self._failures[index] = 0
+                if isinstance(answer, str):
+                    cause = answer
                 else:
-                    self._replace(index, failure)
-                    cause = failure
-            silent = self._replace_silent(pending)
-            pending -= silent
-            cause = self._silence() if silent else cause
+                    statistics[index] = answer
         self.busy = False
         if not statistics:
             raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
-        return self.merge(statistics)
+        finished = sorted(statistics)
+        slots = [self.slot(index, self._iteration) for index in finished]
+        ordered = [statistics[index] for index in finished]
+        return merge(slots, ordered, self._version, time.monotonic() - self._started)
+
+    def write_parameters(self, copy: int, parameters: dict[str, np.ndarray]) -> None:
+        """Fills one of the copies of the parameters in shared memory, which no worker may be using."""
+        for name, array in self._block.parameters[copy].items():
+            array[:] = parameters[name]
+
+    def order(self, index: int, iteration: int, copy: int) -> None:
+        """Asks one worker to fill its slot of an iteration with a copy of the parameters; returns at once."""
+        self._block.heartbeat[index] = time.monotonic()
+        slot = iteration % shared_memory.NUM_BUFFERS
+        self._send(index, {"do": "collect", "iteration": iteration, "parameters": copy, "slot": slot})
+
+    def slot(self, index: int, iteration: int) -> dict[str, np.ndarray]:
+        """Where a worker writes in an iteration; it does so again two iterations later."""
+        return self._block.slots[iteration % shared_memory.NUM_BUFFERS][index]
+
+    def answers(self, indices: Iterable[int], timeout_s: float) -> dict[int, dict[str, Any] | str]:
+        """Waits for any of the workers that were given an order.
+
+        Returns:
+          By worker: the statistics of one that has finished; how it was lost of one that was, and was replaced.
+
+        Raises:
+          WorkerError: one failed too many times in a row.
+        """
+        answers: dict[int, dict[str, Any] | str] = {}
+        by_connection = {self._workers[index].connection: index for index in indices}
+        for ready in wait(list(by_connection), timeout_s):
+            index = by_connection[cast(Connection, ready)]
+            reply, failure = self._receive(index)
+            if failure is None:
+                answers[index] = json.loads(reply)
+                self._failures[index] = 0
+            else:
+                answers[index] = failure
+                self._replace(index, failure)
+        for index in self._replace_silent(set(by_connection.values()) - answers.keys()):
+            answers[index] = self._silence()
+        return answers
 
     def save(self) -> list[bytes]:
         """The state of every worker's environments; only between `finish` and `start`.
@@ -266,24 +284,3 @@ class CpuPool:
                 return
             except WorkerError as error:
                 cause = f"was replaced in vain: {error}"
-
-    def merge(self, statistics: dict[int, dict[str, Any]]) -> Collected:
-        """Copies the slots of the latest iteration into one buffer and shifts their start and end indices.
-
-        Args:
-          statistics: the replies of the workers that finished, by their index.
-        """
-        slots = self._block.slots[self._iteration % shared_memory.NUM_BUFFERS]
-        finished = [slots[index] for index in sorted(statistics)]
-        counts = [int(slot["num_segments"][0]) for slot in finished]
-        offsets = [position * self.plan.steps_per_worker for position in range(len(finished))]
-        per_step = finished[0].keys() - {"start", "end", "initial_carry", "num_segments"}
-        return Collected(
-            fields={name: np.concatenate([slot[name] for slot in finished]) for name in sorted(per_step)},
-            start=np.concatenate([s["start"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
-            end=np.concatenate([s["end"][:n] + o for s, n, o in zip(finished, counts, offsets, strict=True)]),
-            initial_carry=np.concatenate([s["initial_carry"][:n] for s, n in zip(finished, counts, strict=True)]),
-            version=self._version,
-            statistics=[statistics[index] for index in sorted(statistics)],
-            seconds=time.monotonic() - self._started,
-        )

@@ -18,7 +18,7 @@ from hasrl_jax.config import Config, NetworkConfig
 
 Specs = dict[str, tuple[tuple[int, ...], str]]  # name -> (shape, dtype)
 ALIGNMENT = 64  # bytes, a cache line
-NUM_BUFFERS = 2  # parameters and trajectories are double-buffered: one is written while the other is read
+NUM_BUFFERS = 2  # everything is double-buffered: one is written while the other is read
 
 
 def create(size: int) -> int:
@@ -104,17 +104,17 @@ def parameter_specs(observation_size: int, action_size: int, network: NetworkCon
 
 
 class Block:
-    """The whole shared block: heartbeats, parameter buffers, and two trajectory slots per worker."""
+    """The whole shared block: heartbeats, copies of the parameters, and two trajectory slots per worker."""
 
-    def __init__(self, descriptor: int, num_workers: int, parameters: Specs, slot: Specs):
+    def __init__(self, descriptor: int, num_workers: int, num_copies: int, parameters: Specs, slot: Specs):
         beat: Specs = {"heartbeat": ((num_workers,), "float64")}
-        self.size = size_of(beat) + NUM_BUFFERS * (size_of(parameters) + num_workers * size_of(slot))
+        self.size = size_of(beat) + num_copies * size_of(parameters) + NUM_BUFFERS * num_workers * size_of(slot)
         self.descriptor = create(self.size) if descriptor < 0 else descriptor
         self._memory = mmap.mmap(self.descriptor, self.size)
         self.heartbeat = views(self._memory, beat, 0)["heartbeat"]
         offset = size_of(beat)
         self.parameters: list[Parameters] = []
-        for _ in range(NUM_BUFFERS):
+        for _ in range(num_copies):
             self.parameters.append(views(self._memory, parameters, offset))
             offset += size_of(parameters)
         self.slots: list[list[dict[str, np.ndarray]]] = []  # [buffer][worker]
@@ -139,4 +139,6 @@ def open_block(config: Config, plan: Plan, observation_size: int, action_size: i
     num_segments = plan.steps_per_worker // (plan.max_length if unrolls else 1)
     slot = slot_specs(plan.steps_per_worker, num_segments, observation_size, action_size, plan.carry_shape)
     parameters = parameter_specs(observation_size, action_size, config.network)
-    return Block(descriptor, plan.num_workers, parameters, slot)
+    # Workers that collect together share two copies; those that go their own way have one each.
+    num_copies = plan.num_workers if config.schedule == "decoupled" else NUM_BUFFERS
+    return Block(descriptor, plan.num_workers, num_copies, parameters, slot)

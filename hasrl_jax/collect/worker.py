@@ -210,9 +210,9 @@ def serve(connection: Connection, descriptor: int) -> None:
         beat()
         if message["do"] == "collect":
             iteration = message["iteration"]
-            buffer = iteration % shared_memory.NUM_BUFFERS
+            parameters, slot = block.parameters[message["parameters"]], block.slots[message["slot"]][index]
             cpu, wall = time.process_time(), time.monotonic()
-            statistics = actor.collect(block.parameters[buffer], block.slots[buffer][index], iteration, beat)
+            statistics = actor.collect(parameters, slot, iteration, beat)
             spent = {"cpu_seconds": time.process_time() - cpu, "seconds": time.monotonic() - wall}
             reply(connection, statistics | spent)
         elif message["do"] == "save":

@@ -23,6 +23,8 @@ class Batch(NamedTuple):
     advantage: jax.Array  # [B, T]
     target: jax.Array  # [B, T]
     weight: jax.Array  # [B, T] bool, steps that the losses average over
+    proximal_log_prob: jax.Array  # [B, T] log-probability that ratios are taken against: the behaviour's, or corrected
+    importance: jax.Array | None = None  # [B, T] weights of the surrogate; None: all 1
 
 
 def prepare_batch(trajectory: Trajectory, ppo: PPOConfig) -> tuple[Batch, Metrics]:
@@ -61,7 +63,78 @@ def prepare_batch(trajectory: Trajectory, ppo: PPOConfig) -> tuple[Batch, Metric
     if ppo.standardize_advantages:
         advantage = returns.masked_standardize(advantage, mask)
     weight = mask if ppo.mask_padding else jnp.ones_like(mask)
-    return Batch(steps, advantage, jnp.where(mask, target, 0.0), weight), {"explained_variance": explained_variance}
+    batch = Batch(steps, advantage, jnp.where(mask, target, 0.0), weight, steps.log_prob)
+    return batch, {"explained_variance": explained_variance}
+
+
+def correct_for_lag(
+    batch: Batch,
+    params: Parameters,
+    policy: Policy,
+    mean: jax.Array | None,
+    std: jax.Array | None,
+    version: jax.Array,
+    max_importance: float,
+) -> tuple[Batch, Metrics]:
+    """Separates the policy that ratios are taken against from the older ones that acted, once per iteration.
+
+        proximal log-prob = log pi_now(a_t | s_t), with the parameters before the update
+        importance_t = min(pi_now(a_t | s_t) / behaviour probability, max_importance)
+
+    Clipping then limits how far this update moves the policy, and the weights account for how far it had moved since
+    the data was collected. Trajectories of the present version keep the recorded log-probabilities and the weight 1,
+    so that fresh data gives exactly the ordinary loss.
+
+    Args:
+      batch: from `prepare_batch`, [B, T, ...].
+      params: policy parameters before the update.
+      policy: the network.
+      mean: [O] normaliser mean before the update.
+      std: [O] normaliser deviation.
+      version: [] int32, of `params`.
+      max_importance: where the weights are cut off.
+
+    Returns:
+      (batch, {"importance_mean"} over valid steps).
+
+    Source: Hilton, Cobbe and Schulman (2021), Batch size-invariance for policy optimization, the decoupled clipped
+    objective. Differs: the proximal policy is the newest, and the weights are truncated.
+    """
+    steps = batch.trajectory
+    recomputed = _log_prob(params, policy, steps, mean, std)
+    stale = steps.mask & (steps.policy_version != version)[:, None]
+    log_weight = jnp.clip(recomputed - steps.log_prob, -_MAX_LOG_RATIO, jnp.log(max_importance))
+    importance = jnp.where(stale, jnp.exp(log_weight), 1.0)
+    proximal_log_prob = jnp.where(stale, recomputed, steps.log_prob)
+    metrics = {"importance_mean": returns.masked_mean(importance, steps.mask)}
+    return batch._replace(proximal_log_prob=proximal_log_prob, importance=importance), metrics
+
+
+def policy_lag(trajectory: Trajectory, version: jax.Array) -> Metrics:
+    """How many versions older than `version` the parameters were that acted, over trajectories with a valid step.
+
+    Args:
+      trajectory: [B, T, ...].
+      version: [] int32, of the learner's parameters.
+
+    Returns:
+      {"policy_lag" (the mean), "policy_lag_min", "policy_lag_max"}.
+    """
+    valid = jnp.any(trajectory.mask, axis=1)
+    lag = version - trajectory.policy_version
+    return {
+        "policy_lag": returns.masked_mean(lag, valid),
+        "policy_lag_min": jnp.min(lag, where=valid, initial=2**31 - 1).astype(jnp.float32),
+        "policy_lag_max": jnp.max(lag, where=valid, initial=-1).astype(jnp.float32),
+    }
+
+
+def _log_prob(
+    params: Parameters, policy: Policy, steps: Trajectory, mean: jax.Array | None, std: jax.Array | None
+) -> jax.Array:
+    """Log-probability of the actions taken, [B, T]."""
+    action_mean, _ = policy.apply({"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std)
+    return distributions.log_prob(steps.action, action_mean, networks.log_std(policy, params))
 
 
 def policy_loss(
@@ -69,9 +142,10 @@ def policy_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Clipped surrogate and entropy bonus.
 
-        ratio_t = exp(log pi(a_t | s_t) - behaviour log-prob)
-        loss = -E_t[min(ratio_t A_t, clip(ratio_t, 1 - clip, 1 + clip) A_t)] - c1 H
+        ratio_t = exp(log pi(a_t | s_t) - proximal log-prob)
+        loss = -E_t[importance_t min(ratio_t A_t, clip(ratio_t, 1 - clip, 1 + clip) A_t)] - c1 H
 
+    The proximal log-prob is the behaviour's and the importance 1, unless `correct_for_lag` made them otherwise.
     E_t averages over `batch.weight`; the approximate KL, E[(ratio - 1) - log ratio], and the clip fraction always
     average over valid steps only.
 
@@ -89,14 +163,14 @@ def policy_loss(
     Source: paper II.E (actor loss); Schulman et al. (2017).
     """
     steps = batch.trajectory
-    action_mean, _ = policy.apply({"params": params}, steps.observation, steps.initial_carry, steps.is_first, mean, std)
-    log_std = networks.log_std(policy, params)
-    log_ratio = distributions.log_prob(steps.action, action_mean, log_std) - steps.log_prob
+    log_ratio = _log_prob(params, policy, steps, mean, std) - batch.proximal_log_prob
     log_ratio = jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-    entropy = distributions.entropy(log_std)
+    if batch.importance is not None:
+        surrogate = batch.importance * surrogate
+    entropy = distributions.entropy(networks.log_std(policy, params))
     loss = -returns.masked_mean(surrogate, batch.weight) - ppo.entropy_coefficient * entropy
     return loss, {
         "actor_loss": loss,

@@ -16,7 +16,16 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hasrl_jax.config import Config, ConfigError, PPOConfig
 from hasrl_jax.learn import networks, normalize
 from hasrl_jax.learn.batching import minibatch_indices
-from hasrl_jax.learn.losses import Batch, Metrics, Parameters, policy_loss, prepare_batch, value_loss
+from hasrl_jax.learn.losses import (
+    Batch,
+    Metrics,
+    Parameters,
+    correct_for_lag,
+    policy_lag,
+    policy_loss,
+    prepare_batch,
+    value_loss,
+)
 from hasrl_jax.learn.networks import Policy, Value, make_networks
 from hasrl_jax.types import Mirror, Trajectory
 
@@ -34,6 +43,10 @@ _POLICY_METRICS = (
     "policy_updates",
     "policy_gradient_norm",
 )
+
+
+class LearnerError(RuntimeError):
+    """The update failed on its device; the message carries the cause."""
 
 
 class LearnerState(NamedTuple):
@@ -133,17 +146,20 @@ class Update:
         self._split = NamedSharding(mesh, PartitionSpec("data"))
         self._jitted = jax.jit(
             self._iteration,
-            in_shardings=(self._replicated, self._split),
+            in_shardings=(self._replicated, self._split, self._replicated),
             out_shardings=(self._replicated, self._replicated),
             donate_argnums=0,
         )
 
-    def __call__(self, state: LearnerState, trajectory: Trajectory) -> tuple[LearnerState, Metrics]:
+    def __call__(
+        self, state: LearnerState, trajectory: Trajectory, replayed: bool = False
+    ) -> tuple[LearnerState, Metrics]:
         """Runs the program.
 
         Args:
           state: the learner; donated.
           trajectory: [B, T, ...], see `Trajectory`.
+          replayed: it was learnt from before, so steps and observation statistics do not count it again.
 
         Raises:
           ValueError: B, the minibatch size and the number of devices do not divide each other.
@@ -156,15 +172,22 @@ class Update:
             )
         # Placed here rather than by jit, so that the first call and all later ones share one compiled program.
         state = jax.device_put(state, self._replicated)
-        return self._jitted(state, jax.device_put(trajectory, self._split))
+        return self._jitted(state, jax.device_put(trajectory, self._split), np.asarray(not replayed))
 
-    def _iteration(self, state: LearnerState, trajectory: Trajectory) -> tuple[LearnerState, Metrics]:
+    def _iteration(
+        self, state: LearnerState, trajectory: Trajectory, counts: jax.Array
+    ) -> tuple[LearnerState, Metrics]:
         """Advantages once, then all epochs and minibatches, then the normaliser."""
         self.trace_count += 1
         log.info("compiling the update for %d trajectories of %d steps", *trajectory.reward.shape)
         config, ppo = self.config, self.config.ppo
         batch, metrics = prepare_batch(trajectory, ppo)
         statistics = normalize.mean_std(state.normalizer, config.network.normalize_observations)
+        metrics |= policy_lag(trajectory, state.update_count)
+        if config.schedule == "decoupled":
+            acted = state.policy_params, self.policy, *statistics, state.update_count
+            batch, importance = correct_for_lag(batch, *acted, config.decoupled.max_importance)
+            metrics |= importance
         scale = jnp.ones(())
         if ppo.learning_rate_schedule == "linear":
             scale = jnp.maximum(0.0, 1.0 - state.env_steps.astype(jnp.float32) / config.total_env_steps)
@@ -192,8 +215,8 @@ class Update:
         steps = batch.trajectory
         normalizer = state.normalizer
         if config.network.normalize_observations:
-            normalizer = normalize.update(normalizer, steps.observation, steps.mask)
-        added = jnp.sum(steps.mask, dtype=jnp.int32)
+            normalizer = normalize.update(normalizer, steps.observation, steps.mask & counts)
+        added = jnp.sum(steps.mask & counts, dtype=jnp.int32)
         new_state = LearnerState(
             policy_params=policy[0],
             value_params=value[0],

@@ -73,7 +73,7 @@ def test_workers_buffers_are_merged_with_indices_re_based(make_pool, parameters,
         assert (steps["terminated"] | steps["truncated"])[end - 1].all()
     (first, *_), (second, *_) = by_worker(collected)
     assert np.all(first["action"] != second["action"])
-    assert collected.version == 0
+    np.testing.assert_array_equal(collected.version, np.zeros(len(collected.start), np.int32))
 
 
 def test_two_buffers_alternate_and_saved_environments_continue_identically(make_pool, parameters):

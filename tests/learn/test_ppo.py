@@ -244,3 +244,77 @@ def test_learns_a_bandit_whose_best_action_depends_on_the_observation() -> None:
         state, _ = update(state, trajectory)
         trajectory, error = play(state)
     assert error < 0.25 * first_error
+
+
+@functools.cache
+def _correct() -> Any:
+    """`(state, trajectory) -> (batch, corrected batch)`."""
+    policy, _ = make_networks(NETWORK, OBSERVATION, ACTION, None)
+
+    def compute(state: ppo.LearnerState, trajectory: Trajectory) -> tuple[losses.Batch, losses.Batch]:
+        batch, _ = losses.prepare_batch(trajectory, PPO)
+        acted = state.policy_params, policy, *normalize.mean_std(state.normalizer), state.update_count
+        return batch, losses.correct_for_lag(batch, *acted, 2.0)[0]
+
+    return jax.jit(compute)
+
+
+def _loss(params: Any, state: ppo.LearnerState, batch: losses.Batch) -> tuple[jax.Array, losses.Metrics]:
+    """Operation by operation: a compiler would round the two losses differently where it fuses them."""
+    policy, _ = make_networks(NETWORK, OBSERVATION, ACTION, None)
+    return losses.policy_loss(params, policy, batch, *normalize.mean_std(state.normalizer), PPO)
+
+
+def _moved(state: ppo.LearnerState, by: float) -> Any:
+    return jax.tree.map(
+        lambda leaf: leaf + by * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), state.policy_params
+    )
+
+
+def test_fresh_data_gives_exactly_the_ordinary_loss() -> None:
+    state, _ = _learner(_config())
+    plain, corrected = _correct()(state, _fresh(state, LENGTHS))
+    np.testing.assert_array_equal(corrected.proximal_log_prob, plain.trajectory.log_prob)
+    np.testing.assert_array_equal(corrected.importance, 1.0)
+    params = _moved(state, 0.02)
+    for left, right in zip(*(_numbers(_loss(params, state, batch)) for batch in (plain, corrected)), strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_stale_data_is_weighted_and_clipped_around_the_policy_before_the_update() -> None:
+    state, _ = _learner(_config())
+    trajectory = _fresh(state, LENGTHS)
+    now = state._replace(policy_params=_moved(state, 0.15), update_count=jnp.int32(3))  # the data is of version 0
+    batch, corrected = _correct()(now, trajectory)
+    loss, metrics = _loss(now.policy_params, now, corrected)
+    # Before it has moved, every ratio is 1 and the loss is the weighted advantage.
+    np.testing.assert_allclose(metrics["ratio_mean"], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(metrics["approx_kl"], 0.0, atol=1e-6)
+    policy, _ = _networks(NETWORK)
+    statistics = normalize.mean_std(state.normalizer)
+    carry = trajectory.initial_carry
+    mean = policy(now.policy_params, trajectory.observation, carry, trajectory.is_first, *statistics)
+    log_prob = np.asarray(distributions.log_prob(trajectory.action, mean, now.policy_params["log_std"]))
+    weight = np.minimum(np.exp(log_prob - trajectory.log_prob), 2.0)[trajectory.mask]
+    assert weight.max() == 2.0 and weight.min() < 0.8
+    advantage = np.asarray(batch.advantage)[trajectory.mask]
+    entropy = float(distributions.entropy(now.policy_params["log_std"]))
+    np.testing.assert_allclose(loss, -(weight * advantage).mean() - PPO.entropy_coefficient * entropy, rtol=1e-4)
+
+
+def test_lag_is_measured_on_the_trajectories_and_a_replay_counts_nothing() -> None:
+    config = dataclasses.replace(_config(), schedule="decoupled")
+    state, update = _learner(config)
+    state = state._replace(update_count=jnp.int32(7))
+    version = np.array([7, 5, 4, *[6] * (B - 3)], np.int32)
+    version[LENGTHS == 0] = -99  # an empty row says nothing
+    state, metrics = update(state, _fresh(state, LENGTHS)._replace(policy_version=version))
+    lag = 7 - version[LENGTHS > 0]
+    found = [float(metrics[name]) for name in ("policy_lag", "policy_lag_min", "policy_lag_max")]
+    np.testing.assert_allclose(found, [lag.mean(), 0, 3], rtol=1e-6)
+    before = jax.tree.map(np.asarray, (state.env_steps, state.normalizer))
+    state, _ = update(state, _fresh(state, LENGTHS), replayed=True)
+    for left, right in zip(_numbers(before), _numbers((state.env_steps, state.normalizer)), strict=True):
+        np.testing.assert_array_equal(left, right)
+    assert int(state.update_count) == 9
+    assert update._jitted._cache_size() == 1
