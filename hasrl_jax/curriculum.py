@@ -24,6 +24,8 @@ class Stage(NamedTuple):
 def stages(config: Config) -> list[Stage]:
     """The whole run in order; a single stage when `config.stages` is empty.
 
+    A stage whose end is not after the end of another before it has nothing left to do.
+
     Raises:
       ConfigError: an entry that cannot be read, is out of order, or leads to impossible settings; names the entry.
     """
@@ -37,16 +39,6 @@ def stages(config: Config) -> list[Stage]:
         found.append(Stage(current, min(at, config.total_env_steps)))
         begin, current = at, _apply(changes, current, name)
     return [*found, Stage(current, config.total_env_steps)]
-
-
-def remaining(config: Config, env_steps: int) -> list[Stage]:
-    """The stages that a run with so many environment steps has not finished."""
-    left = []
-    for stage in stages(config):
-        if env_steps < stage.until_env_steps:
-            left.append(stage)
-            env_steps = stage.until_env_steps
-    return left
 
 
 def _parse(text: str, name: str) -> tuple[int, list[tuple[str, Any]]]:

@@ -4,7 +4,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from hasrl_jax import checkpoint, cli
+from hasrl_jax import checkpoint, cli, curriculum
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.collectors import Collector, Experience, make_collector, prepare_jax
 from hasrl_jax.config import Config
@@ -21,7 +21,8 @@ from hasrl_jax.envs.task import Task
 from hasrl_jax.evaluate import run_episodes
 from hasrl_jax.learn import ppo
 from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record
-from hasrl_jax.run_directory import open_run, write_config
+from hasrl_jax.run_directory import RunDirectory, open_run, write_config
+from hasrl_jax.types import Mirror
 
 log = logging.getLogger("hasrl_jax")
 TEST_SEED = 1_000_003  # apart from every training stream
@@ -35,8 +36,26 @@ class Progress(NamedTuple):
     seconds: float = 0.0  # spent training
 
 
+class RunState(NamedTuple):
+    """All that a checkpoint holds."""
+
+    learner: ppo.LearnerState
+    progress: Progress = Progress()
+    env_states: Sequence[bytes] = ()  # empty: episodes begin anew
+
+
+class Part(NamedTuple):
+    """A stage of the run with all that works on it."""
+
+    config: Config
+    until_env_steps: int
+    task: Task
+    update: ppo.Update
+    collector: Collector
+
+
 def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.Update] = ppo.make_update) -> None:
-    """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM.
+    """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM, through the stages of its curriculum.
 
     Args:
       config: the run's configuration.
@@ -44,61 +63,96 @@ def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.U
       make_update: makes the learner's program; benchmarks put another in its place.
     """
     prepare_jax(config)
-    task, mesh = make_task(config), ppo.make_mesh()
-    sizes = (task.observation_size, task.action_size, task.mirror)
-    update, collector = make_update(config, *sizes, mesh), make_collector(config, task, mesh)
+    parts = [prepare(stage, make_update) for stage in curriculum.stages(config)]  # also refuses what cannot work
+    learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
+    state = RunState(learner)
     with open_run(config, resume) as run, stop_signal() as stop:
-        learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
-        progress, env_states = Progress(), []
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
-            learner, progress, env_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
+            state = RunState(loaded.learner, Progress(**loaded.extra), loaded.blobs)
             write_config(run.path, config)  # some settings may differ from now on
+        else:
+            save(config, run.checkpoints, state)  # whatever happens now, --resume has a beginning
         with (
-            collector,
-            MetricsWriter(run.path, progress.iteration) as writer,
-            ProgressPrinter(config.total_env_steps, progress.env_steps) as printer,
+            MetricsWriter(run.path, state.progress.iteration) as writer,
+            ProgressPrinter(config.total_env_steps, state.progress.env_steps) as printer,
         ):
-            announce(config, collector, task, run.path, progress)
-            collector.load(env_states)
-            if not resume:
-                save(config, run.checkpoints, progress, learner, [])  # whatever happens now, --resume has a beginning
-            while progress.env_steps < config.total_env_steps and not stop:
-                started = time.monotonic()
-                if not collector.busy:
-                    collector.start(learner, progress.iteration, version=progress.iteration)
-                try:
-                    experience = collector.finish()
-                except WorkerError:
-                    save(config, run.checkpoints, progress, learner, [])
-                    raise
-                env_steps = progress.env_steps + experience.env_steps
-                if config.schedule == "overlap" and env_steps < config.total_env_steps and not stop:
-                    collector.start(learner, progress.iteration + 1, version=progress.iteration)
-
-                update_started = time.monotonic()
-                learner, metrics = learn(update, learner, experience, progress.iteration + 1)
-                now = time.monotonic()
-                progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
-                record: Record = {
-                    **{"iteration": progress.iteration, "env_steps": env_steps, "train_seconds": progress.seconds},
-                    **experience.record,
-                    **metrics,
-                    "env_steps_per_second": experience.env_steps / (now - started),
-                    "wait_seconds": update_started - started,
-                    "update_seconds": now - update_started,
-                }
-
-                last = env_steps >= config.total_env_steps
-                if due(progress.iteration, config.evaluate.every_iterations) or last:
-                    record |= test_record(config, task, learner)
-                writer.write(record)
-                printer.update(record)
-                if due(progress.iteration, config.checkpoint.every_iterations):
-                    save(config, run.checkpoints, progress, learner, collector.save())
-            if not due(progress.iteration, config.checkpoint.every_iterations):
-                save(config, run.checkpoints, progress, learner, collector.save())
+            for part in parts:
+                if state.progress.env_steps < part.until_env_steps and not stop:
+                    state = train_part(part, state, run, stop, [writer.write, printer.update])
+    progress = state.progress
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
+
+
+def prepare(stage: curriculum.Stage, make_update: Callable[..., ppo.Update]) -> Part:
+    """Makes what a stage needs; nothing starts or compiles yet.
+
+    Raises:
+      ConfigError: the settings do not fit together, or this machine.
+    """
+    config, until = stage
+    task, mesh = make_task(config), ppo.make_mesh()
+    return Part(config, until, task, make_update(config, *sizes(task), mesh), make_collector(config, task, mesh))
+
+
+def train_part(
+    part: Part, state: RunState, run: RunDirectory, stop: "Stop", report: list[Callable[[Record], None]]
+) -> RunState:
+    """Collects and learns under one configuration until its stage ends or `stop` is true; returns what it saved.
+
+    Args:
+      part: from `prepare`.
+      state: where the run stands.
+      run: takes the checkpoints.
+      stop: asked after every iteration.
+      report: given the metrics of every iteration.
+    """
+    config, until, task, update, collector = part
+    learner, progress, env_states = state
+    with collector:
+        announce(part, run.path, progress)
+        collector.load(list(env_states))
+        while progress.env_steps < until and not stop:
+            started = time.monotonic()
+            if not collector.busy:
+                collector.start(learner, progress.iteration, version=progress.iteration)
+            try:
+                experience = collector.finish()
+            except WorkerError:
+                save(config, run.checkpoints, RunState(learner, progress))
+                raise
+            env_steps = progress.env_steps + experience.env_steps
+            if config.schedule == "overlap" and env_steps < until and not stop:
+                collector.start(learner, progress.iteration + 1, version=progress.iteration)
+
+            update_started = time.monotonic()
+            learner, metrics = learn(update, learner, experience, progress.iteration + 1)
+            now = time.monotonic()
+            progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
+            record: Record = {
+                **{"iteration": progress.iteration, "env_steps": env_steps, "train_seconds": progress.seconds},
+                **experience.record,
+                **metrics,
+                "env_steps_per_second": experience.env_steps / (now - started),
+                "wait_seconds": update_started - started,
+                "update_seconds": now - update_started,
+            }
+
+            if due(progress.iteration, config.evaluate.every_iterations) or env_steps >= config.total_env_steps:
+                record |= test_record(config, task, learner)
+            for give in report:
+                give(record)
+            if due(progress.iteration, config.checkpoint.every_iterations):
+                save(config, run.checkpoints, RunState(learner, progress, collector.save()))
+        state = RunState(learner, progress, collector.save())
+        if not due(progress.iteration, config.checkpoint.every_iterations):
+            save(config, run.checkpoints, state)
+    return state
+
+
+def sizes(task: Task) -> tuple[int, int, Mirror | None]:
+    """What the networks are made from."""
+    return task.observation_size, task.action_size, task.mirror
 
 
 def learn(
@@ -137,11 +191,12 @@ def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record
     }
 
 
-def save(
-    config: Config, directory: Path, progress: Progress, learner: ppo.LearnerState, env_states: list[bytes]
-) -> None:
+def save(config: Config, directory: Path, state: RunState) -> None:
     """A checkpoint with everything needed to continue."""
-    checkpoint.save(directory, progress.iteration, learner, progress._asdict(), env_states, config.checkpoint.keep)
+    learner, progress, env_states = state
+    checkpoint.save(
+        directory, progress.iteration, learner, progress._asdict(), list(env_states), config.checkpoint.keep
+    )
 
 
 def due(iteration: int, every: int) -> bool:
@@ -149,8 +204,9 @@ def due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
 
 
-def announce(config: Config, collector: Collector, task: Task, run_dir: Path, progress: Progress) -> None:
-    """The first lines of a run: what runs where, and how fast the physics is sampled."""
+def announce(part: Part, run_dir: Path, progress: Progress) -> None:
+    """The first lines of a run or stage: what runs where, and how fast the physics is sampled."""
+    config, until, task, _, collector = part
     devices = ", ".join(str(device) for device in jax.devices())
     log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
     log.info(
@@ -160,7 +216,8 @@ def announce(config: Config, collector: Collector, task: Task, run_dir: Path, pr
         1 / task.env_step_s,
     )
     after = f", continuing after iteration {progress.iteration}" if progress.iteration else ""
-    log.info("run directory %s%s", run_dir, after)
+    end = f", stage until {until:,} environment steps" if config.stages else ""
+    log.info("run directory %s%s%s", run_dir, after, end)
 
 
 class Stop:

@@ -23,15 +23,9 @@ def test_settings_change_and_stay() -> None:
     assert third.config.ppo.clip == 0.1
 
 
-@pytest.mark.parametrize(("env_steps", "left"), [(0, 3), (999, 3), (1000, 2), (2500, 1), (5000, 0), (9000, 0)])
-def test_what_a_resumed_run_has_left(env_steps: int, left: int) -> None:
-    config = config_module.from_dict({"stages": STAGES, "total_env_steps": 5000})
-    assert len(curriculum.remaining(config, env_steps)) == left
-
-
 def test_a_short_run_ends_within_its_stages() -> None:
     config = config_module.from_dict({"stages": STAGES, "total_env_steps": 1500})
-    assert [stage.until_env_steps for stage in curriculum.remaining(config, 0)] == [1000, 1500]
+    assert [stage.until_env_steps for stage in curriculum.stages(config)] == [1000, 1500, 1500]
 
 
 def test_without_stages_there_is_one() -> None:

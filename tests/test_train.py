@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
@@ -108,6 +109,20 @@ def test_a_resumed_run_gives_the_same_numbers(tmp_path, tiny):
     assert len(untimed(whole)) == 4
     # The first half's last iteration is evaluated because it is the last; the evaluation changes nothing.
     assert untimed(halves) == untimed(whole)
+
+
+def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
+    tiny.write_text(TINY + "stages: ['256 ppo.policy_learning_rate=1e-5', '384 ppo.value_learning_rate=1e-5']\n")
+    assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "whole")]) == 0
+    assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "parts"), "--total-env-steps", "384"]) == 0
+    assert train.main(["--resume", str(tmp_path / "parts"), "--total-env-steps", "512"]) == 0
+    whole = untimed(tmp_path / "whole")
+    np.testing.assert_allclose([record["learning_rate"] for record in whole], [3e-4, 3e-4, 1e-5, 1e-5], rtol=1e-6)
+    assert without_tests(whole) == without_tests(untimed(tmp_path / "parts"))
+
+
+def without_tests(records: list[dict]) -> list[dict]:
+    return [{name: value for name, value in record.items() if "test" not in name} for record in records]
 
 
 def test_overlap_acts_with_parameters_one_version_old(tmp_path, tiny):
