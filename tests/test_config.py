@@ -61,7 +61,7 @@ def test_no_field_accepts_a_value_outside_its_limits_or_nan(name):
         "--ppo.value_learning_rate inf",
         "--cassie.clock.swing-fraction -3",
         "--cassie.clock.max-swing-fraction 5",
-        "--cassie.clock.cycle-per-speed-s -1",
+        "--cassie.clock.cycle-per-speed-s -2",
         "--cassie.termination.max-tilt-deg -10",
         "--cassie.termination.max-tilt-deg 1000",
         "--cassie.termination.min-height-m 2",
