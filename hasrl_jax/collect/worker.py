@@ -28,6 +28,7 @@ from hasrl_jax.envs.task import Task
 from hasrl_jax.types import Mirror
 
 PR_SET_PDEATHSIG = 1
+VALUE_BATCH = 512  # states whose values are computed at once: few calls, and all of it stays in a core's cache
 
 
 class Actor:
@@ -64,44 +65,54 @@ class Actor:
             if name not in ("initial_carry", "start", "end", "num_segments")
         }
         unroll_carries = []
-        sums: dict[str, Any] = {"diverged": 0, "inference": 0.0, "environment": 0.0}
+        sums: dict[str, Any] = {"inference": 0.0, "environment": 0.0}
         sums["reward_terms"] = np.zeros(len(self.task.reward_terms))
         physics_before = self.envs.physics_seconds
+        log_std = numpy_policy.log_std(parameters, self.mirror)
+        noise = rng.standard_normal((horizon, num_envs, self.task.action_size), np.float32)
+        deviation = np.exp(log_std) * noise
         for t in range(horizon):
             if t % self.plan.max_length == 0:
                 unroll_carries.append(np.where(self.state.is_first[:, None, None, None], np.float32(0), self.carry))
-            self._step(parameters, by_env, t, rng, sums)
+            self._step(parameters, by_env, t, deviation[t], rng, sums)
             beat()
-        self._close_buffer(parameters, by_env)
+        by_env["log_prob"][:] = numpy_policy.log_prob(noise, log_std).T
+        cpu_stepped = time.process_time()
+        self._close_buffer(parameters, slot, by_env)
+        sums["inference"] += time.process_time() - cpu_stepped
         self._index_segments(slot, by_env, unroll_carries)
         valid = max(int(by_env["mask"].sum()), 1)
         terms = dict(zip(self.task.reward_terms, (sums["reward_terms"] / valid).tolist(), strict=True))
         physics = self.envs.physics_seconds - physics_before
         return {
             "reward_terms": terms,
-            "diverged": int(sums["diverged"]),
+            "diverged": int((~by_env["mask"]).sum()),
             "physics_cpu_seconds": physics,
             "inference_cpu_seconds": sums["inference"],
             "environment_cpu_seconds": sums["environment"] - physics,  # observation, reward and reset
         }
 
     def _step(
-        self, parameters: numpy_policy.Parameters, by_env: dict, t: int, rng: np.random.Generator, sums: dict[str, Any]
+        self,
+        parameters: numpy_policy.Parameters,
+        by_env: dict,
+        t: int,
+        deviation: np.ndarray,
+        rng: np.random.Generator,
+        sums: dict[str, Any],
     ) -> None:
-        """One environment step of every environment, written to column `t`."""
+        """One environment step of every environment, written to column `t`; `_close_buffer` adds the rest.
+
+        `deviation` [E, A] is what exploration adds to the mean action.
+        """
         state = self.state
         cpu_start = time.process_time()
         inputs = numpy_policy.streams(state.observation, parameters, self.mirror)
         mean, self.carry = numpy_policy.policy_step(parameters, inputs, self.carry, state.is_first, self.mirror)
-        log_std = numpy_policy.log_std(parameters, self.mirror)
-        noise = rng.standard_normal(mean.shape, np.float32)
-        action = mean + np.exp(log_std) * noise
+        action = mean + deviation
         by_env["observation"][:, t] = state.observation
         by_env["is_first"][:, t] = state.is_first
         by_env["action"][:, t] = action
-        by_env["log_prob"][:, t] = numpy_policy.log_prob(noise, log_std)
-        by_env["value"][:, t] = numpy_policy.value(parameters, inputs)
-        returns_before, steps_before = state.episode_return, state.episode_step
         cpu_acted = time.process_time()
         self.state, result = self.envs.step(state, action, rng)
         sums["inference"] += cpu_acted - cpu_start
@@ -113,31 +124,35 @@ class Actor:
         by_env["truncated"][:, t] = result.truncated
         by_env["mask"][:, t] = valid
         by_env["bootstrap_value"][:, t] = 0.0
-        if t and result.diverged.any():  # the step before a lost one bootstraps from the state where it led
-            lost = result.diverged & by_env["mask"][:, t - 1] & ~state.is_first
-            by_env["truncated"][lost, t - 1] = True
-            by_env["bootstrap_value"][lost, t - 1] = by_env["value"][lost, t]
         if result.truncated.any():
             cut = np.flatnonzero(result.truncated)
             final = numpy_policy.streams(result.final_observation[cut], parameters, self.mirror)
             by_env["bootstrap_value"][cut, t] = numpy_policy.value(parameters, final)
         ended = result.terminated | result.truncated
-        by_env["episode_return"][:, t] = np.where(ended, returns_before + result.reward, 0.0)
-        by_env["episode_length"][:, t] = np.where(ended, steps_before + 1, 0)
+        by_env["episode_return"][:, t] = np.where(ended, state.episode_return + result.reward, 0.0)
+        by_env["episode_length"][:, t] = np.where(ended, state.episode_step + 1, 0)
         sums["reward_terms"] += result.reward_terms[valid].sum(axis=0)
-        sums["diverged"] += int(result.diverged.sum())
 
-    def _close_buffer(self, parameters: numpy_policy.Parameters, by_env: dict) -> None:
-        """Cuts what the buffer's end cuts: the last step of every trajectory bootstraps from what follows it."""
-        horizon, unroll = self.plan.steps_per_env, self.plan.max_length
-        in_unrolls = self.config.collect.mode == "unrolls"
-        last = np.arange(unroll - 1, horizon, unroll) if in_unrolls else np.array([horizon - 1])
+    def _close_buffer(self, parameters: numpy_policy.Parameters, slot: dict, by_env: dict) -> None:
+        """Adds the values, and cuts the last step of every trajectory and the step before a lost one.
+
+        Both bootstrap from the state that follows them, which is the next one recorded.
+        """
+        observation, value, mask = slot["observation"], slot["value"], by_env["mask"]
+        for start in range(0, len(value), VALUE_BATCH):
+            some = slice(start, start + VALUE_BATCH)
+            value[some] = numpy_policy.value(parameters, numpy_policy.streams(observation[some], parameters, self.mirror))
         inputs = numpy_policy.streams(self.state.observation, parameters, self.mirror)
         final = numpy_policy.value(parameters, inputs)
-        following = np.concatenate([by_env["value"][:, last[:-1] + 1], final[:, None]], axis=1)
-        cut = ~by_env["terminated"][:, last] & ~by_env["truncated"][:, last] & by_env["mask"][:, last]
-        by_env["truncated"][:, last] |= cut
-        by_env["bootstrap_value"][:, last] = np.where(cut, following, by_env["bootstrap_value"][:, last])
+        is_cut = np.zeros_like(mask)
+        is_cut[:, :-1] = ~mask[:, 1:] & ~by_env["is_first"][:, 1:]
+        if self.config.collect.mode == "unrolls":
+            is_cut[:, self.plan.max_length - 1 :: self.plan.max_length] = True
+        is_cut[:, -1] = True
+        is_cut &= mask & ~by_env["terminated"] & ~by_env["truncated"]
+        following = np.concatenate([by_env["value"][:, 1:], final[:, None]], axis=1)
+        by_env["truncated"] |= is_cut
+        by_env["bootstrap_value"][is_cut] = following[is_cut]
 
     def _index_segments(self, slot: dict, by_env: dict, unroll_carries: list[np.ndarray]) -> None:
         """Writes the start and end index of each trajectory in the flat buffer, and the carry it starts from."""

@@ -143,8 +143,8 @@ def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
     PD loop has calmed down, it would be up to a fifth too low.
     """
     ids = constants.ids
-    error = rewards.quaternion_error(sensordata[..., ids.foot_orientation], np.array(rewards.NEUTRAL_FOOT_QUAT), xp)
-    power = xp.sum(xp.abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]), axis=-1, keepdims=True)
+    error = rewards.quaternion_error(sensordata[..., ids.foot_orientation], rewards.NEUTRAL_FOOT_QUAT)
+    power = xp.abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]).sum(axis=-1, keepdims=True)
     return xp.concatenate([sensordata[..., ids.foot_force], error, power], axis=-1)
 
 
@@ -186,7 +186,7 @@ def step(
         torque=torque,
     )
     observation = observe(constants, state, reading.qpos, reading.qvel, acceleration, xp)
-    return Transition(state, observation, xp.sum(terms, axis=-1), terminated, terms, measures)
+    return Transition(state, observation, terms.sum(axis=-1), terminated, terms, measures)
 
 
 def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, xp: Any) -> Array:
@@ -226,23 +226,23 @@ def reward_errors(
     settings = config.reward
     speed = state.command[..., 0]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
-    foot_speed = xp.sqrt(xp.sum(reading.sensordata[..., ids.foot_velocity] ** 2, axis=-1))
+    foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     drift = reading.qpos[..., 1] - (path_y if settings.follow_lateral_command else 0.0)
-    pelvis_error = rewards.quaternion_error(reading.qpos[..., 3:7], np.array([1.0, 0.0, 0.0, 0.0]), xp)
+    pelvis_error = 1.0 - reading.qpos[..., 3] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     velocity_error = xp.abs(reading.qvel[..., :2] - state.command)
     torque_change = xp.abs(reading.sensordata[..., ids.torque] - state.torque)
     return {
         "foot_force": rewards.clock_score(force_clock, reading.averages[..., :2], rewards.MAX_FOOT_FORCE_N, xp),
         "foot_velocity": rewards.clock_score(-force_clock, foot_speed, rewards.MAX_FOOT_SPEED_M_S, xp),
-        "orientation": 10 * pelvis_error + 10 * xp.sum(reading.averages[..., 2:4], axis=-1),
+        "orientation": 10 * pelvis_error + 10 * reading.averages[..., 2:4].sum(axis=-1),
         "pelvis_motion": rewards.pelvis_motion(
             drift, reading.qpos[..., 2], speed, reading.qvel[..., 3:6], acceleration, settings, xp
         ),
         "velocity": settings.velocity_sharpness
         * (velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]),
-        "hip_roll": xp.sum(xp.abs(reading.qvel[..., ids.hip_roll_qvel]), axis=-1),
-        "torque_change": 0.25 * xp.mean(torque_change, axis=-1),
-        "action_change": 5 * xp.mean(xp.abs(action - state.action), axis=-1),
+        "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
+        "torque_change": 0.25 * torque_change.mean(axis=-1),
+        "action_change": 5 * xp.abs(action - state.action).mean(axis=-1),
     }
 
 

@@ -43,9 +43,9 @@ def force_clocks(phase: Array, swing: Array, xp: Any) -> Array:
     edges of different value its slope is zero at both, because the neighbouring segments are flat, so
     it equals the cubic 3u^2 - 2u^3; this closed form needs no spline per episode.
     """
-    left_swings = _bump(xp.mod(phase + 0.5, 1.0), swing, xp)
-    right_swings = _bump(phase, swing, xp)
-    return xp.stack([right_swings - left_swings, left_swings - right_swings], axis=-1)
+    own_phase = xp.stack([xp.mod(phase + 0.5, 1.0), phase], axis=-1)
+    swings = _bump(own_phase, swing[..., None], xp)
+    return swings[..., ::-1] - swings
 
 
 def _bump(phase: Array, swing: Array, xp: Any) -> Array:

@@ -8,12 +8,14 @@ published implementation.
 
 from typing import Any
 
+import numpy as np
+
 from hasrl_jax.cassie_config import RewardConfig
 from hasrl_jax.types import Array
 
+SCORES = ("foot_force", "foot_velocity")
 TERMS = (
-    "foot_force",
-    "foot_velocity",
+    *SCORES,
     "orientation",
     "pelvis_motion",
     "velocity",
@@ -25,7 +27,7 @@ MAX_FOOT_FORCE_N = 350.0
 MAX_FOOT_SPEED_M_S = 2.0
 CLOCK_GAIN = 1.2
 # World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
-NEUTRAL_FOOT_QUAT = (-0.24790886, -0.24679713, -0.66093967, 0.66392102)
+NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
 
 
 def clock_score(clock: Array, magnitude: Array, limit: float, xp: Any) -> Array:
@@ -36,12 +38,12 @@ def clock_score(clock: Array, magnitude: Array, limit: float, xp: Any) -> Array:
       magnitude: ground force (N) or foot speed (m/s), non-negative, [..., 2].
     """
     share = xp.minimum(magnitude, limit) / limit
-    return xp.sum(xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share), axis=-1)
+    return xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share).sum(axis=-1)
 
 
-def quaternion_error(quat: Array, reference: Array, xp: Any) -> Array:
+def quaternion_error(quat: Array, reference: Array) -> Array:
     """1 - <reference, quat>^2, the squared sine of half the angle between them: [..., 4] -> [...]."""
-    return 1.0 - xp.sum(quat * reference, axis=-1) ** 2
+    return 1.0 - (quat * reference).sum(axis=-1) ** 2
 
 
 def pelvis_motion(
@@ -66,16 +68,16 @@ def pelvis_motion(
     drift = xp.where(drift < 0.05, 0.0, drift)
     height_error = xp.abs(height_m - config.height_m)
     height_error = xp.where(height_error < 0.05 + 0.05 * xp.abs(speed), 0.0, height_error)
-    shaking = xp.sum(xp.abs(angular_velocity), axis=-1) + xp.sum(xp.abs(acceleration), axis=-1)
+    shaking = xp.abs(angular_velocity).sum(axis=-1) + xp.abs(acceleration).sum(axis=-1)
     return drift + height_error + config.shaking * shaking
 
 
 def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> Array:
     """The weighted, scaled terms in the order of `TERMS`, [..., 8]; their sum is the reward.
 
-    `errors` holds the two scores S_F and S_V under `foot_force` and `foot_velocity`, and for every
-    other term the non-negative error E whose exp(-E) is rewarded.
+    `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
+    non-negative error E whose exp(-E) is rewarded.
     """
-    values = [errors[name] if name in ("foot_force", "foot_velocity") else xp.exp(-errors[name]) for name in TERMS]
-    weights = [config.scale * getattr(config, name) for name in TERMS]
-    return xp.stack([weight * value for weight, value in zip(weights, values, strict=True)], axis=-1)
+    values = xp.stack([errors[name] for name in TERMS], axis=-1)
+    values = xp.concatenate([values[..., : len(SCORES)], xp.exp(-values[..., len(SCORES) :])], axis=-1)
+    return values * np.array([config.scale * getattr(config, name) for name in TERMS])
