@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from hasrl_jax.envs.task import Reading, Task
+from hasrl_jax.envs.task import Reading, Reset, Task
 from hasrl_jax.types import Array
 
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -45,7 +45,10 @@ class StepResult(NamedTuple):
 
 
 class CpuEnvs:
-    """E copies of a task, each with a model of its own so that every episode can randomise it.
+    """E copies of a task, each with a model of its own if episodes randomise it.
+
+    Fresh episodes are prepared E at a time, because drawing many costs little more than drawing one. Those that are
+    left never outlive the generator they were drawn from, so results depend on states and generators alone.
 
     Args:
       task: the definition to run.
@@ -60,7 +63,10 @@ class CpuEnvs:
         self.max_episode_steps = max_episode_steps
         self.num_envs = num_envs
         self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
-        self._models = [copy.copy(task.model) for _ in range(num_envs)]
+        self._models = [task.model] * num_envs
+        self._prepared: Reset | None = None  # E fresh episodes
+        self._taken = 0  # of the prepared episodes
+        self._source: Any = None  # the generator that drew them
         self._data = mujoco.MjData(task.model)
         self._rollout = rollout.Rollout(nthread=0)  # on the calling thread: one core per worker
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
@@ -87,8 +93,11 @@ class CpuEnvs:
 
     def restore(self, state: EnvState) -> None:
         """Writes the randomised fields of `state` into the models, as `step` expects to find them."""
-        for env, model in enumerate(self._models):
-            _write_fields(model, {name: values[env] for name, values in state.model_fields.items()})
+        self._prepared = None
+        if state.model_fields and self._models[0] is self.task.model:  # one model for all would stay in the cache
+            self._models = [copy.copy(self.task.model) for _ in range(self.num_envs)]
+        for env in range(self.num_envs):
+            self._write_fields(env, state.model_fields, env)
 
     def step(self, state: EnvState, action: np.ndarray, rng: np.random.Generator) -> tuple[EnvState, StepResult]:
         """One environment step; environments whose episode ended are reset.
@@ -158,32 +167,35 @@ class CpuEnvs:
         return reading, diverged
 
     def _reset_some(self, state: EnvState, envs: np.ndarray, rng: np.random.Generator) -> EnvState:
-        """`state` with fresh episodes in the environments numbered `envs`."""
-        fresh = self.task.reset(rng.random((len(envs), self.task.reset_uniforms)), np)
-        physics = np.concatenate([np.zeros((len(envs), 1)), fresh.qpos, fresh.qvel], axis=1)
-        state = EnvState(
-            physics=_put(state.physics, envs, physics),
-            task=type(state.task)(*(_put(old, envs, new) for old, new in zip(state.task, fresh.state, strict=True))),
-            model_fields={name: _put(old, envs, fresh.model_fields[name]) for name, old in state.model_fields.items()},
-            observation=_put(state.observation, envs, fresh.observation),
-            is_first=_put(state.is_first, envs, True),
-            episode_step=_put(state.episode_step, envs, 0),
-            episode_return=_put(state.episode_return, envs, 0.0),
+        """`state` with fresh episodes in the environments numbered `envs`; takes over its arrays where it owns them."""
+        if self._prepared is None or self._source is not rng or self._taken + len(envs) > self.num_envs:
+            self._prepared = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
+            self._taken, self._source = 0, rng
+        fresh, rows = self._prepared, slice(self._taken, self._taken + len(envs))
+        self._taken = rows.stop
+
+        def put(values: np.ndarray, new: np.ndarray) -> np.ndarray:
+            values = values.copy()  # it belongs to an earlier state or to the result of this step, too
+            values[envs] = new[rows]
+            return values
+
+        # These arrays were made for this state alone.
+        state.physics[envs] = 0.0
+        state.physics[envs, 1:] = np.concatenate([fresh.qpos[rows], fresh.qvel[rows]], axis=1)
+        state.is_first[envs], state.episode_step[envs], state.episode_return[envs] = True, 0, 0.0
+        for row, env in zip(range(rows.start, rows.stop), envs, strict=True):
+            self._write_fields(env, fresh.model_fields, row)
+        return state._replace(
+            task=type(state.task)(*map(put, state.task, fresh.state)),
+            model_fields={name: put(values, fresh.model_fields[name]) for name, values in state.model_fields.items()},
+            observation=put(state.observation, fresh.observation),
         )
-        for row, env in enumerate(envs):
-            _write_fields(self._models[env], {name: values[row] for name, values in fresh.model_fields.items()})
-        return state
 
-
-def _put(values: np.ndarray, where: np.ndarray, new: Any) -> np.ndarray:
-    values = values.copy()
-    values[where] = new
-    return values
-
-
-def _write_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
-    for name, value in fields.items():
-        if name == "timestep":
-            model.opt.timestep = value
-        else:
-            getattr(model, name)[:] = value
+    def _write_fields(self, env: int, fields: dict[str, np.ndarray], row: int) -> None:
+        """Row `row` of the randomised fields into the model of environment `env`."""
+        model = self._models[env]
+        for name, values in fields.items():
+            if name == "timestep":
+                model.opt.timestep = values[row]
+            else:
+                getattr(model, name)[:] = values[row]
