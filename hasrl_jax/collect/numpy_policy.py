@@ -57,7 +57,8 @@ def policy_step(
       The action mean [E, A] in [-1, 1], and the next carry.
     """
     num_streams, num_envs, _ = inputs.shape
-    carry = np.where(is_first[:, None, None, None], np.float32(0), carry)
+    carry = carry.copy()
+    carry[is_first] = 0
     per_stream = carry.reshape(num_envs, LAYERS, 2, num_streams, -1).transpose(1, 2, 3, 0, 4)
     following = np.empty_like(per_stream)
     x = inputs.reshape(num_streams * num_envs, -1)

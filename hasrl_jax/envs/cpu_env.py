@@ -62,6 +62,7 @@ class CpuEnvs:
         self.task = task
         self.max_episode_steps = max_episode_steps
         self.num_envs = num_envs
+        self._timestep = task.model.opt.timestep
         self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
         self._models = [task.model] * num_envs
         self._prepared: Reset | None = None  # E fresh episodes
@@ -113,7 +114,7 @@ class CpuEnvs:
         if not np.isfinite(action).all():
             raise FloatingPointError("the policy produced an action that is not finite")
         task = self.task
-        reading, diverged = self._simulate(state, task.control(state.task, action, np))
+        physics, reading, diverged = self._simulate(state, task.control(state.task, action, np))
         result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)
         episode_step = state.episode_step + 1
         terminated = result.terminated & ~diverged
@@ -122,7 +123,7 @@ class CpuEnvs:
             result.reward, terminated, truncated, diverged, result.observation, result.reward_terms, result.measures
         )
         state = EnvState(
-            physics=self._states[:, -1].copy(),
+            physics=physics,
             task=result.state,
             model_fields=state.model_fields,
             observation=result.observation,
@@ -133,8 +134,12 @@ class CpuEnvs:
         ended = np.flatnonzero(terminated | truncated | diverged)
         return (self._reset_some(state, ended, rng) if len(ended) else state), step_result
 
-    def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[Reading, np.ndarray]:
-        """Runs the physics steps of one environment step; also says which simulations diverged, [E] bool."""
+    def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[np.ndarray, Reading, np.ndarray]:
+        """Runs the physics steps of one environment step.
+
+        Returns:
+          The physics state, what the task reads of it, and which simulations diverged, [E] bool.
+        """
         task, model = self.task, self.task.model
         self._controls[:, :, : model.nu] = control[:, None]
         if task.force:
@@ -152,19 +157,19 @@ class CpuEnvs:
             sensordata=self._sensordata,
         )
         self.physics_seconds += time.process_time() - cpu
-        end = self._states[:, -1]
+        end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
-        timestep = state.model_fields.get("timestep", model.opt.timestep)
+        timestep = state.model_fields.get("timestep", self._timestep)
         elapsed = end[:, 0] - state.physics[:, 0]
         on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
-        diverged = ~(on_time & np.isfinite(end).all(axis=1) & np.isfinite(self._sensordata[:, -1]).all(axis=1))
+        diverged = ~(on_time & np.isfinite(end).all(axis=1) & np.isfinite(sensordata).all(axis=1))
         reading = Reading(
             qpos=end[:, 1 : 1 + model.nq],
             qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
-            sensordata=self._sensordata[:, -1],
+            sensordata=sensordata,
             averages=task.physics_features(self._sensordata, np).mean(axis=1),
         )
-        return reading, diverged
+        return end, reading, diverged
 
     def _reset_some(self, state: EnvState, envs: np.ndarray, rng: np.random.Generator) -> EnvState:
         """`state` with fresh episodes in the environments numbered `envs`; takes over its arrays where it owns them."""
