@@ -66,7 +66,7 @@ class NetworkConfig:
 @dataclass(frozen=True)
 class CollectConfig:
     num_workers: int = field(default_factory=available_cores)  # worker processes; the default is one per core
-    envs_per_worker: int = 32  # environments stepped together by one worker
+    envs_per_worker: int = 0  # environments stepped together by one worker; 0 takes what the iteration fills, to 128
     env_steps_per_iteration: int = 16384  # environment steps per iteration, all workers together
     mode: Literal["unrolls", "episodes"] = "unrolls"  # fixed-length pieces, or whole episodes from a fresh reset
     unroll_length: int = 64  # environment steps per trajectory in `unrolls` mode

@@ -53,7 +53,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "network.hidden_size": (1, 8192),
     "network.initial_log_std": (-10, 3),
     "collect.num_workers": (1, 4096),
-    "collect.envs_per_worker": (1, 65536),
+    "collect.envs_per_worker": (0, 65536),
     "collect.env_steps_per_iteration": (1, 10**9),
     "collect.unroll_length": (1, 10**6),
     "collect.max_episode_steps": (1, 10**6),

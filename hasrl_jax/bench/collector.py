@@ -15,7 +15,7 @@ import psutil
 from hasrl_jax.bench.physics_limit import PhysicsLimit
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.cpu_pool import CpuPool
-from hasrl_jax.collect.plan import make_plan
+from hasrl_jax.collect.plan import MOST_ENVS, make_plan
 from hasrl_jax.config import Config, available_cores
 from hasrl_jax.config_checks import check
 from hasrl_jax.envs.registry import make_task
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = Config()
     parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
     parser.add_argument("--num-workers", type=int, nargs="+", default=sorted({1, available_cores()}), metavar="N")
-    parser.add_argument("--envs-per-worker", type=int, default=default.collect.envs_per_worker, metavar="E")
+    parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")
     parser.add_argument("--physics", choices=(*PHYSICS, "both"), default="both", help="2 kHz x 50, or 2.5 ms x 10")
     parser.add_argument("--hidden", type=int, default=default.network.hidden_size, help="width of the networks")
     parser.add_argument("--symmetric", action="store_true", help="mirror-equivariant networks")

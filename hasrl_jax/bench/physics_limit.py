@@ -13,6 +13,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.config import Config
 from hasrl_jax.envs.cpu_env import PHYSICS_STATE, CpuEnvs
 from hasrl_jax.envs.registry import make_task
@@ -78,7 +79,7 @@ def _serve(connection: Connection, config: Config, env_steps: int, seed: int) ->
 
 def record(config: Config, env_steps: int, seed: int) -> list[Stretch]:
     """About `env_steps` environment steps under the actions of a policy that has learnt nothing."""
-    task, num_envs = make_task(config), config.collect.envs_per_worker
+    task, num_envs = make_task(config), make_plan(config).envs_per_worker
     envs = CpuEnvs(task, num_envs, config.collect.max_episode_steps)
     rng = np.random.default_rng([config.seed, seed])
     state = envs.reset(rng)

@@ -16,7 +16,7 @@ from hasrl_jax.bench import collector
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.buffer import merge
 from hasrl_jax.collect.cpu_pool import CpuPool
-from hasrl_jax.collect.plan import make_plan
+from hasrl_jax.collect.plan import MOST_ENVS, make_plan
 from hasrl_jax.collectors import to_trajectory
 from hasrl_jax.config import Config, ConfigError, available_cores
 from hasrl_jax.config_checks import check
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = Config()
     parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
     parser.add_argument("--num-workers", type=int, nargs="+", default=[1, 2, 4, 8], metavar="N", help="1 always runs")
-    parser.add_argument("--envs-per-worker", type=int, default=default.collect.envs_per_worker, metavar="E")
+    parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")
     parser.add_argument("--physics", choices=tuple(collector.PHYSICS), default="fast", help="2 kHz, or 400 Hz")
     parser.add_argument("--hidden", type=int, default=default.network.hidden_size, help="width of the networks")
     parser.add_argument("--symmetric", action="store_true", help="mirror-equivariant networks")

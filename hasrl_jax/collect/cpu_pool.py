@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from hasrl_jax.collect import shared_memory
+from hasrl_jax.collect import numpy_policy, shared_memory
 from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.config import Config, to_dict
@@ -207,7 +207,7 @@ class CpuPool:
             [sys.executable, "-m", "hasrl_jax.collect.worker", *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
-            env=os.environ | ONE_THREAD,
+            env=numpy_policy.blas_variables() | os.environ | ONE_THREAD,
         )
         theirs.close()
         setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}

@@ -2,7 +2,9 @@
 
 from typing import NamedTuple
 
-from hasrl_jax.config import Config
+from hasrl_jax.config import CollectConfig, Config
+
+MOST_ENVS = 128  # environments per worker that are chosen by themselves; what more would gain: docs/performance.md
 
 
 class Plan(NamedTuple):
@@ -28,10 +30,7 @@ class Plan(NamedTuple):
 def make_plan(config: Config) -> Plan:
     """Rounds the budget up so that every environment collects the same number of steps."""
     collect = config.collect
-    num_workers, envs_per_worker = collect.num_workers, collect.envs_per_worker
-    if collect.mode == "unrolls":  # on many cores, fewer environments each rather than a larger iteration
-        most = collect.env_steps_per_iteration // (num_workers * collect.unroll_length)
-        envs_per_worker = max(1, min(envs_per_worker, most))
+    num_workers, envs_per_worker = collect.num_workers, _envs_per_worker(collect)
     num_envs = num_workers * envs_per_worker
     steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
     minibatch = config.ppo.minibatch_trajectories
@@ -44,3 +43,17 @@ def make_plan(config: Config) -> Plan:
         rows = minibatch  # episodes vary in number: the batch grows by whole minibatches
     rows = -(-rows // minibatch) * minibatch
     return Plan(num_workers, envs_per_worker, steps_per_env, max_length, rows, config.network.carry_shape)
+
+
+def _envs_per_worker(collect: CollectConfig) -> int:
+    """The configured number, unless it would make the iteration larger; or else as many as fill the iteration.
+
+    Many environments share the cost of every NumPy call.
+    """
+    if collect.envs_per_worker:
+        most = collect.env_steps_per_iteration // (collect.num_workers * collect.unroll_length)
+        return collect.envs_per_worker if collect.mode == "episodes" else max(1, min(collect.envs_per_worker, most))
+    length = collect.unroll_length if collect.mode == "unrolls" else collect.max_episode_steps
+    trajectories = -(-collect.env_steps_per_iteration // (collect.num_workers * length))
+    rounds = -(-trajectories // MOST_ENVS)
+    return -(-trajectories // rounds)

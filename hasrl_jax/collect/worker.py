@@ -141,7 +141,9 @@ class Actor:
         observation, value, mask = slot["observation"], slot["value"], by_env["mask"]
         for start in range(0, len(value), VALUE_BATCH):
             some = slice(start, start + VALUE_BATCH)
-            value[some] = numpy_policy.value(parameters, numpy_policy.streams(observation[some], parameters, self.mirror))
+            value[some] = numpy_policy.value(
+                parameters, numpy_policy.streams(observation[some], parameters, self.mirror)
+            )
         inputs = numpy_policy.streams(self.state.observation, parameters, self.mirror)
         final = numpy_policy.value(parameters, inputs)
         is_cut = np.zeros_like(mask)

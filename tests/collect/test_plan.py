@@ -31,3 +31,13 @@ def test_an_episode_is_cut_by_its_cap_or_by_the_buffer(make_config, cap, expecte
 def test_a_symmetric_policy_carries_two_streams(make_config):
     assert make_plan(make_config(symmetric=False)).carry_shape == (2, 2, 16)
     assert make_plan(make_config(symmetric=True)).carry_shape == (2, 2, 32)
+
+
+@pytest.mark.parametrize(
+    ("mode", "num_workers", "expected"),
+    [("unrolls", 1, (128, 128)), ("unrolls", 2, (128, 64)), ("unrolls", 3, (86, 64)), ("episodes", 2, (20, 410))],
+)
+def test_environments_are_chosen_to_fill_the_budget(make_config, mode, num_workers, expected):
+    sizes = {"env_steps_per_iteration": 16384, "unroll_length": 64, "max_episode_steps": 420}
+    plan = make_plan(make_config(mode=mode, num_workers=num_workers, envs_per_worker=0, **sizes))
+    assert (plan.envs_per_worker, plan.steps_per_env) == expected
