@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from hasrl_jax import checkpoint, cli
+from hasrl_jax import checkpoint, cli, distributed
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.collectors import Collector, Experience, make_collector, prepare_jax
 from hasrl_jax.config import Config
@@ -20,7 +20,7 @@ from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.evaluate import run_episodes
 from hasrl_jax.learn import ppo
-from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record
+from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record, Silent
 from hasrl_jax.run_directory import open_run, write_config
 
 log = logging.getLogger("hasrl_jax")
@@ -44,26 +44,31 @@ def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.U
       make_update: makes the learner's program; benchmarks put another in its place.
     """
     prepare_jax(config)
+    distributed.join(config)
     task, mesh = make_task(config), ppo.make_mesh()
     sizes = (task.observation_size, task.action_size, task.mirror)
     update, collector = make_update(config, *sizes, mesh), make_collector(config, task, mesh)
-    with open_run(config, resume) as run, stop_signal() as stop:
+    reports = config.distributed.process_id == 0
+    if config.distributed.num_processes > 1:
+        collector = distributed.SharedExperience(config, collector, mesh)
+    with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
         learner = ppo.init_learner(config, *sizes, jax.random.key(config.seed))
         progress, env_states = Progress(), []
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
             learner, progress, env_states = loaded.learner, Progress(**loaded.extra), loaded.blobs
-            write_config(run.path, config)  # some settings may differ from now on
+            if reports:
+                write_config(run.path, config)  # some settings may differ from now on
         with (
             collector,
-            MetricsWriter(run.path, progress.iteration) as writer,
-            ProgressPrinter(config.total_env_steps, progress.env_steps) as printer,
+            MetricsWriter(run.path, progress.iteration) if reports else Silent() as writer,
+            ProgressPrinter(config.total_env_steps, progress.env_steps) if reports else Silent() as printer,
         ):
             announce(config, collector, task, run.path, progress)
             collector.load(env_states)
             if not resume:
                 save(config, run.checkpoints, progress, learner, [])  # whatever happens now, --resume has a beginning
-            while progress.env_steps < config.total_env_steps and not stop:
+            while progress.env_steps < config.total_env_steps and not distributed.any_process(config, bool(stop)):
                 started = time.monotonic()
                 if not collector.busy:
                     collector.start(learner, progress.iteration, version=progress.iteration)
@@ -90,7 +95,7 @@ def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.U
                 }
 
                 last = env_steps >= config.total_env_steps
-                if due(progress.iteration, config.evaluate.every_iterations) or last:
+                if reports and (due(progress.iteration, config.evaluate.every_iterations) or last):
                     record |= test_record(config, task, learner)
                 writer.write(record)
                 printer.update(record)
@@ -140,8 +145,9 @@ def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record
 def save(
     config: Config, directory: Path, progress: Progress, learner: ppo.LearnerState, env_states: list[bytes]
 ) -> None:
-    """A checkpoint with everything needed to continue."""
-    checkpoint.save(directory, progress.iteration, learner, progress._asdict(), env_states, config.checkpoint.keep)
+    """A checkpoint with everything needed to continue; of several processes, the first one writes it."""
+    if config.distributed.process_id == 0:
+        checkpoint.save(directory, progress.iteration, learner, progress._asdict(), env_states, config.checkpoint.keep)
 
 
 def due(iteration: int, every: int) -> bool:

@@ -6,7 +6,7 @@ from hasrl_jax.config import Config
 
 
 class Plan(NamedTuple):
-    """Sizes that follow from the configuration and stay fixed for a run."""
+    """Sizes of one training process that follow from the configuration and stay fixed for a run."""
 
     num_workers: int
     envs_per_worker: int
@@ -21,20 +21,20 @@ class Plan(NamedTuple):
 
     @property
     def env_steps(self) -> int:
-        """Environment steps per iteration, all workers together."""
+        """Environment steps per iteration, all workers of the process together."""
         return self.num_workers * self.steps_per_worker
 
 
 def make_plan(config: Config) -> Plan:
-    """Rounds the budget up so that every environment collects the same number of steps."""
-    collect = config.collect
+    """This process's share, rounded up so that every environment collects the same number of steps."""
+    collect, processes = config.collect, config.distributed.num_processes
+    budget, minibatch = -(-collect.env_steps_per_iteration // processes), config.ppo.minibatch_trajectories // processes
     num_workers, envs_per_worker = collect.num_workers, collect.envs_per_worker
     if collect.mode == "unrolls":  # on many cores, fewer environments each rather than a larger iteration
-        most = collect.env_steps_per_iteration // (num_workers * collect.unroll_length)
+        most = budget // (num_workers * collect.unroll_length)
         envs_per_worker = max(1, min(envs_per_worker, most))
     num_envs = num_workers * envs_per_worker
-    steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
-    minibatch = config.ppo.minibatch_trajectories
+    steps_per_env = -(-budget // num_envs)
     if collect.mode == "unrolls":
         max_length = collect.unroll_length
         steps_per_env = -(-steps_per_env // max_length) * max_length
