@@ -159,12 +159,6 @@ def exchange(value: Any) -> list[Any]:
     return [message["value"] for message in messages]
 
 
-def gone(error: Exception) -> OtherProcessError:
-    """The error of a program over all devices that lacks an answer."""
-    atexit.register(_leave)
-    return OtherProcessError(f"another training process is gone ({' '.join(str(error).split())[:200]})")
-
-
 def _leave() -> None:
     """Ends this process without JAX's farewell, which would wait for the process that is gone and then abort."""
     sys.stdout.flush()
@@ -176,10 +170,6 @@ def ending_together(config: Config) -> Iterator[None]:
     """When one process fails, all others fail at their next `exchange`, rather than wait for it in vain."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if config.distributed.num_processes > 1:
-            raise gone(error) from None
-        raise
     except Exception as error:
         if config.distributed.num_processes > 1 and not isinstance(error, OtherProcessError):
             _exchange({"failure": f"{type(error).__name__}: {error}"})
@@ -194,8 +184,10 @@ def _exchange(message: dict[str, Any]) -> list[dict[str, Any]]:
         padded = np.zeros(1 << int(sizes.max() - 1).bit_length(), np.uint8)  # few shapes, since each is compiled
         padded[: len(data)] = data
         rows = multihost_utils.process_allgather(padded)
-    except jax.errors.JaxRuntimeError as error:
-        raise gone(error) from None
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises either, as the call returns early or late
+        atexit.register(_leave)
+        reason = " ".join(str(error).split())[:200]
+        raise OtherProcessError(f"another training process is gone ({reason}); use --resume") from None
     return [json.loads(row[:size].tobytes()) for row, size in zip(rows, sizes, strict=True)]
 
 

@@ -104,6 +104,23 @@ def test_the_command_in_two_processes_is_one_run(tmp_path, monkeypatch):
         np.testing.assert_allclose(array, of_alone[name], rtol=1e-4, atol=1e-4, err_msg=name)
 
 
+def test_when_a_process_is_killed_the_other_ends_with_one_line(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    arguments = ["-m", "hasrl_jax.train", "--config", tmp_path / "tiny.yaml", "--run-dir", tmp_path / "run"]
+    arguments += ["--distributed.coordinator", free_address(), "--distributed.num-processes", 2]
+    arguments += ["--total-env-steps", 10**9, "--distributed.process-id"]
+    first, second = (start(*arguments, index) for index in (0, 1))
+    for line in first.stdout:
+        if line.startswith("iteration 2"):
+            break
+    second.kill()
+    second.communicate()
+    output = first.communicate(timeout=60)[0]
+    assert first.returncode == 1
+    assert "Traceback" not in output
+    assert output.splitlines()[-1].startswith("error: another training process is gone")
+
+
 def test_a_process_has_its_share_of_the_plan():
     whole = make_plan(from_dict({"collect": {"num_workers": 4}}))
     half = make_plan(from_dict({"collect": {"num_workers": 2}, "distributed": {"num_processes": 2}}))
