@@ -26,4 +26,4 @@ bench:  ## timed figures, JSON beside the tables
 
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv
-	$(BIN)/uv pip compile --universal --python-version 3.11 --extra dev --no-header --no-annotate pyproject.toml -o requirements.lock
+	$(BIN)/uv pip compile --universal --python-version 3.11 --extra dev --extra ray --extra viewer --no-header --no-annotate pyproject.toml -o requirements.lock

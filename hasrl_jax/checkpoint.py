@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from hasrl_jax.learn.ppo import LearnerState
+from hasrl_jax.storage import open_storage
 
 log = logging.getLogger("hasrl_jax")
 
@@ -90,7 +91,7 @@ def save(
         _require_space(directory, sum(array.nbytes for array in [*arrays.values(), *blob_arrays.values()]))
         attempts = [attempt for number, attempt, _ in _saved(directory) if number == step]
         path = directory / (f"{step:09d}.{max(attempts) + 1}" if attempts else f"{step:09d}")
-        with _quiet(), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+        with open_storage() as checkpointer:
             checkpointer.save(partial.absolute(), args=ocp.args.Composite(**items))
         (partial / _FILES_DIGEST).write_text(_digest_of_files(partial))
         partial.rename(path)
@@ -180,7 +181,7 @@ def _restore(path: Path, step: int, template: LearnerState) -> Loaded:
     if (path / _FILES_DIGEST).read_text() != _digest_of_files(path):
         raise _DamagedError("its files do not match their SHA-256 digest")
     wanted = _named_leaves(template)
-    with _quiet(), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+    with open_storage() as checkpointer:
         record = checkpointer.restore(path.absolute(), args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
         saved = {name: (dtype, tuple(shape)) for name, (dtype, shape) in record["leaves"].items()}
         _check_same_network(path, saved, _signature(wanted))
@@ -286,14 +287,3 @@ def _reason(error: BaseException) -> str:
         return error.strerror
     text = " ".join(str(error).split())
     return text if isinstance(error, _DamagedError) else f"{type(error).__name__}: {text[:200]}"
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the storage library's own messages off the terminal; failures arrive as exceptions."""
-    logger, level = logging.getLogger("absl"), logging.getLogger("absl").level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

@@ -19,7 +19,7 @@ from hasrl_jax.arguments import OneLineParser
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.config import Config, ConfigError
 
-SHORTHAND = {"--num-workers": "--collect.num-workers"}
+SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
 OVERRIDABLE_FOR_A_POLICY = ("physics", "cassie")  # what can differ from the training of a policy that is played
 
 

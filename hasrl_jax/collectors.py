@@ -18,6 +18,8 @@ from hasrl_jax.collect.cpu_pool import CpuPool
 from hasrl_jax.collect.free_pool import FreePool
 from hasrl_jax.collect.mjx import ActingParameters, MjxCollector, Statistics, make_mjx_plan
 from hasrl_jax.collect.plan import Plan, make_plan
+from hasrl_jax.collect.ray_cluster import import_ray
+from hasrl_jax.collect.ray_pool import RayPool
 from hasrl_jax.config import Config
 from hasrl_jax.envs.mjx_env import make_engine
 from hasrl_jax.envs.task import Task
@@ -69,14 +71,20 @@ class Collector(Protocol):
 
 
 def make_collector(config: Config, task: Task, mesh: Mesh) -> Collector:
-    """The collector of `config.backend`."""
+    """The collector of `config.backend`.
+
+    Raises:
+      ConfigError: Ray is needed and missing.
+    """
     if config.backend == "mjx":
         return MjxExperience(config, task, mesh)
+    if config.backend == "ray":
+        import_ray(config.ray)
     return FreeExperience(config, task) if config.schedule == "decoupled" else CpuExperience(config, task)
 
 
 class CpuExperience:
-    """A `CpuPool` whose buffers come out as padded trajectories."""
+    """A `CpuPool` or `RayPool` whose buffers come out as padded trajectories."""
 
     def __init__(self, config: Config, task: Task):
         self.config, self.task, self.plan = config, task, make_plan(config)
@@ -87,7 +95,8 @@ class CpuExperience:
         )
 
     def __enter__(self) -> "CpuExperience":
-        self.pool = CpuPool(self.config, self.plan, self.task)
+        pool = RayPool if self.config.backend == "ray" else CpuPool
+        self.pool: CpuPool | RayPool = pool(self.config, self.plan, self.task)
         return self
 
     def __exit__(self, *error: object) -> None:

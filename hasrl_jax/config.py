@@ -76,6 +76,19 @@ class CollectConfig:
 
 
 @dataclass(frozen=True)
+class RayConfig:
+    address: str = ""  # of a running Ray cluster, HOST:PORT; empty starts Ray on this machine alone
+
+
+@dataclass(frozen=True)
+class DistributedConfig:
+    coordinator: str = ""  # HOST:PORT that process 0 listens on; empty when one process trains alone
+    num_processes: int = 1  # training processes that share one learner, usually one per host
+    process_id: int = 0  # of this process, from 0; process 0 writes the run directory
+    start_timeout_s: float = 120.0  # all processes must have joined within this time
+
+
+@dataclass(frozen=True)
 class MjxConfig:
     num_envs: int = 2048  # environments over all devices, a multiple of their number
     impl: Literal["jax", "warp"] = "jax"  # any device, or MuJoCo Warp on NVIDIA
@@ -125,7 +138,7 @@ class CheckpointConfig:
 @dataclass(frozen=True)
 class Config:
     task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
-    backend: Literal["cpu_pool", "mjx"] = "cpu_pool"  # collect in CPU processes, or on the accelerator
+    backend: Literal["cpu_pool", "ray", "mjx"] = "cpu_pool"  # CPU processes, Ray actors, or the accelerator
     schedule: Literal["sync", "overlap", "decoupled"] = "sync"  # collect, then train; collect one ahead; independently
     seed: int = 0  # seeds every random stream
     total_env_steps: int = 50_000_000  # training ends after this many environment steps
@@ -136,6 +149,8 @@ class Config:
     cassie: CassieConfig = field(default_factory=CassieConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
+    ray: RayConfig = field(default_factory=RayConfig)
+    distributed: DistributedConfig = field(default_factory=DistributedConfig)
     mjx: MjxConfig = field(default_factory=MjxConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     decoupled: DecoupledConfig = field(default_factory=DecoupledConfig)

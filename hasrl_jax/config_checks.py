@@ -59,6 +59,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "collect.max_episode_steps": (1, 10**6),
     "collect.worker_start_timeout_s": (1, 86400),
     "collect.worker_timeout_s": (1, 86400),
+    "distributed.num_processes": (1, 4096),
+    "distributed.process_id": (0, 4095),
+    "distributed.start_timeout_s": (1, 86400),
     "mjx.num_envs": (1, 10**6),
     "mjx.contacts_per_env": (1, 10_000),
     "mjx.constraints_per_env": (1, 10_000),
@@ -99,6 +102,7 @@ def check(config: Config) -> None:
     if config.backend != "cpu_pool":
         devices = f"'sync' or 'overlap' with backend {config.backend}, where collecting and learning share the devices"
         _require(config.schedule != "decoupled", "schedule", config.schedule, devices)
+    _check_machines(config)
     if config.task == "cassie" and config.cassie.randomize.enabled:
         scale, timestep_s = config.cassie.randomize.physics_rate_scale, config.physics.timestep_s
         low, high = LIMITS["physics.timestep_s"]
@@ -128,6 +132,32 @@ def _check_cassie(cassie: CassieConfig) -> None:
         cassie.clock.cycle_per_speed_s,
         f"a gait cycle above 0.1 s at {fastest:g} m/s",
     )
+
+
+def _check_machines(config: Config) -> None:
+    """What must fit together when more than one machine takes part."""
+    address = config.ray.address
+    _require(config.backend == "ray" or not address, "ray.address", address, "--backend=ray")
+    _require(
+        not address or _is_host_and_port(address), "ray.address", address, "HOST:PORT of a cluster's head, or none"
+    )
+    distributed, minibatch = config.distributed, config.ppo.minibatch_trajectories
+    coordinator, processes, process_id = distributed.coordinator, distributed.num_processes, distributed.process_id
+    _require(process_id < processes, "distributed.process_id", process_id, f"0 to {processes - 1}, or more processes")
+    if processes == 1:
+        _require(not coordinator, "distributed.coordinator", coordinator, "distributed.num_processes above 1")
+        return
+    there = "HOST:PORT of process 0, the same in all processes"
+    _require(_is_host_and_port(coordinator), "distributed.coordinator", coordinator, there)
+    shared = f"a multiple of the {processes} processes"
+    _require(minibatch % processes == 0, "ppo.minibatch_trajectories", minibatch, shared)
+    _require(config.schedule == "sync", "schedule", config.schedule, "sync with several processes")
+    _require(config.backend == "cpu_pool", "backend", config.backend, "cpu_pool with several processes")
+
+
+def _is_host_and_port(address: str) -> bool:
+    host, _, port = address.rpartition(":")
+    return host != "" and port.isdecimal() and 0 < int(port) < 65536
 
 
 def _number(value: float) -> str:

@@ -41,6 +41,8 @@ def check_packages() -> Iterator[Check]:
     for name in PACKAGES:
         version = _version(name)
         yield Check(name, "ok" if version else "fail", version or "not installed")
+    missing = 'not installed; only --backend=ray needs it: pip install "ray>=2.52"'
+    yield Check("ray", "ok", _version("ray") or missing)
     mujoco, mjx = _version("mujoco"), _version("mujoco-mjx")
     if not mujoco or not mjx:
         yield Check("mujoco", "fail", f"mujoco {mujoco or 'not installed'}, mujoco-mjx {mjx or 'not installed'}")

@@ -157,6 +157,22 @@ class ProgressPrinter:
         return max(0, self._total - last_steps) * (last_time - first_time) / (last_steps - first_steps)
 
 
+class Silent:
+    """Takes the place of the writer and of the printer where another process reports."""
+
+    def __enter__(self) -> "Silent":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def write(self, record: Mapping[str, float | int | None]) -> None:
+        """Does nothing."""
+
+    def update(self, record: Mapping[str, float | int | None]) -> None:
+        """Does nothing."""
+
+
 def progress_line(record: Mapping[str, float | int | None]) -> str:
     """A record as one line for the terminal; what is unknown shows as a dash, a missing test not at all."""
 

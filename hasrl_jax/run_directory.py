@@ -54,8 +54,13 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
     if resume:
         path = Path(config.run_dir)
         _require_run(path)
+    elif config.distributed.process_id:
+        path = Path(config.run_dir)
     else:
         path = _create(config)
+    if config.distributed.process_id:  # the first process holds it for all
+        yield RunDirectory(path)
+        return
     with _locked(path):
         if not resume:
             _require_no_run(path)

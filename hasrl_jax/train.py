@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from hasrl_jax import checkpoint, cli, curriculum
+from hasrl_jax import checkpoint, cli, curriculum, distributed
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.collectors import Collector, Experience, make_collector, prepare_jax
 from hasrl_jax.config import Config
@@ -20,7 +20,7 @@ from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.evaluate import run_episodes
 from hasrl_jax.learn import ppo
-from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record
+from hasrl_jax.metrics import MetricsWriter, ProgressPrinter, Record, Silent
 from hasrl_jax.run_directory import RunDirectory, open_run, write_config
 from hasrl_jax.types import Mirror
 
@@ -63,22 +63,26 @@ def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.U
       make_update: makes the learner's program; benchmarks put another in its place.
     """
     prepare_jax(config)
+    distributed.join(config)
+    reports = config.distributed.process_id == 0
     parts = [prepare(stage, make_update) for stage in curriculum.stages(config)]  # also refuses what cannot work
     learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
     state = RunState(learner)
-    with open_run(config, resume) as run, stop_signal() as stop:
+    with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
             state = RunState(loaded.learner, Progress(**loaded.extra), loaded.blobs)
-            write_config(run.path, config)  # some settings may differ from now on
+            if reports:
+                write_config(run.path, config)  # some settings may differ from now on
         else:
             save(config, run.checkpoints, state)  # whatever happens now, --resume has a beginning
         with (
-            MetricsWriter(run.path, state.progress.iteration) as writer,
-            ProgressPrinter(config.total_env_steps, state.progress.env_steps) as printer,
+            MetricsWriter(run.path, state.progress.iteration) if reports else Silent() as writer,
+            ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else Silent() as printer,
         ):
             for part in parts:
-                if state.progress.env_steps < part.until_env_steps and not stop:
+                stopped = distributed.any_process(config, bool(stop))
+                if state.progress.env_steps < part.until_env_steps and not stopped:
                     state = train_part(part, state, run, stop, [writer.write, printer.update])
     progress = state.progress
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
@@ -92,7 +96,10 @@ def prepare(stage: curriculum.Stage, make_update: Callable[..., ppo.Update]) -> 
     """
     config, until = stage
     task, mesh = make_task(config), ppo.make_mesh()
-    return Part(config, until, task, make_update(config, *sizes(task), mesh), make_collector(config, task, mesh))
+    collector = make_collector(config, task, mesh)
+    if config.distributed.num_processes > 1:
+        collector = distributed.SharedExperience(config, collector, mesh)
+    return Part(config, until, task, make_update(config, *sizes(task), mesh), collector)
 
 
 def train_part(
@@ -109,10 +116,11 @@ def train_part(
     """
     config, until, task, update, collector = part
     learner, progress, env_states = state
+    reports = config.distributed.process_id == 0
     with collector:
         announce(part, run.path, progress)
         collector.load(list(env_states))
-        while progress.env_steps < until and not stop:
+        while progress.env_steps < until and not distributed.any_process(config, bool(stop)):
             started = time.monotonic()
             if not collector.busy:
                 collector.start(learner, progress.iteration, version=progress.iteration)
@@ -138,7 +146,8 @@ def train_part(
                 "update_seconds": now - update_started,
             }
 
-            if due(progress.iteration, config.evaluate.every_iterations) or env_steps >= config.total_env_steps:
+            last = env_steps >= config.total_env_steps
+            if reports and (due(progress.iteration, config.evaluate.every_iterations) or last):
                 record |= test_record(config, task, learner)
             for give in report:
                 give(record)
@@ -192,11 +201,11 @@ def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record
 
 
 def save(config: Config, directory: Path, state: RunState) -> None:
-    """A checkpoint with everything needed to continue."""
+    """A checkpoint with everything needed to continue; of several processes, the first one writes it."""
     learner, progress, env_states = state
-    checkpoint.save(
-        directory, progress.iteration, learner, progress._asdict(), list(env_states), config.checkpoint.keep
-    )
+    keep = config.checkpoint.keep
+    if config.distributed.process_id == 0:
+        checkpoint.save(directory, progress.iteration, learner, progress._asdict(), list(env_states), keep)
 
 
 def due(iteration: int, every: int) -> bool:

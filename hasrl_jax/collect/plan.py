@@ -8,7 +8,7 @@ MOST_ENVS = 128  # environments per worker that are chosen by themselves; what m
 
 
 class Plan(NamedTuple):
-    """Sizes that follow from the configuration and stay fixed for a run."""
+    """Sizes of one training process that follow from the configuration and stay fixed for a run."""
 
     num_workers: int
     envs_per_worker: int
@@ -23,17 +23,17 @@ class Plan(NamedTuple):
 
     @property
     def env_steps(self) -> int:
-        """Environment steps per iteration, all workers together."""
+        """Environment steps per iteration, all workers of the process together."""
         return self.num_workers * self.steps_per_worker
 
 
 def make_plan(config: Config) -> Plan:
-    """Rounds the budget up so that every environment collects the same number of steps."""
-    collect = config.collect
-    num_workers, envs_per_worker = collect.num_workers, _envs_per_worker(collect)
+    """This process's share, rounded up so that every environment collects the same number of steps."""
+    collect, processes = config.collect, config.distributed.num_processes
+    budget, minibatch = -(-collect.env_steps_per_iteration // processes), config.ppo.minibatch_trajectories // processes
+    num_workers, envs_per_worker = collect.num_workers, _envs_per_worker(collect, budget)
     num_envs = num_workers * envs_per_worker
-    steps_per_env = -(-collect.env_steps_per_iteration // num_envs)
-    minibatch = config.ppo.minibatch_trajectories
+    steps_per_env = -(-budget // num_envs)
     if collect.mode == "unrolls":
         max_length = collect.unroll_length
         steps_per_env = -(-steps_per_env // max_length) * max_length
@@ -45,15 +45,15 @@ def make_plan(config: Config) -> Plan:
     return Plan(num_workers, envs_per_worker, steps_per_env, max_length, rows, config.network.carry_shape)
 
 
-def _envs_per_worker(collect: CollectConfig) -> int:
-    """The configured number, unless it would make the iteration larger; or else as many as fill the iteration.
+def _envs_per_worker(collect: CollectConfig, budget: int) -> int:
+    """The configured number, unless it would make the iteration larger; or else as many as fill `budget` steps.
 
     Many environments share the cost of every NumPy call.
     """
     if collect.envs_per_worker:
-        most = collect.env_steps_per_iteration // (collect.num_workers * collect.unroll_length)
+        most = budget // (collect.num_workers * collect.unroll_length)
         return collect.envs_per_worker if collect.mode == "episodes" else max(1, min(collect.envs_per_worker, most))
     length = collect.unroll_length if collect.mode == "unrolls" else collect.max_episode_steps
-    trajectories = -(-collect.env_steps_per_iteration // (collect.num_workers * length))
+    trajectories = -(-budget // (collect.num_workers * length))
     rounds = -(-trajectories // MOST_ENVS)
     return -(-trajectories // rounds)

@@ -97,6 +97,13 @@ def slot_specs(
     }
 
 
+def worker_slot_specs(config: Config, plan: Plan, observation_size: int, action_size: int) -> Specs:
+    """The trajectory buffer of a worker of this run."""
+    unrolls = config.collect.mode == "unrolls"
+    num_segments = plan.steps_per_worker // (plan.max_length if unrolls else 1)
+    return slot_specs(plan.steps_per_worker, num_segments, observation_size, action_size, plan.carry_shape)
+
+
 def parameter_specs(observation_size: int, action_size: int, network: NetworkConfig) -> Specs:
     """One copy of the parameters that the workers act with."""
     shapes = parameter_shapes(observation_size, action_size, network)
@@ -135,9 +142,7 @@ class Block:
 
 def open_block(config: Config, plan: Plan, observation_size: int, action_size: int, descriptor: int = -1) -> Block:
     """The block of a run: a new one, or the one behind an inherited `descriptor`."""
-    unrolls = config.collect.mode == "unrolls"
-    num_segments = plan.steps_per_worker // (plan.max_length if unrolls else 1)
-    slot = slot_specs(plan.steps_per_worker, num_segments, observation_size, action_size, plan.carry_shape)
+    slot = worker_slot_specs(config, plan, observation_size, action_size)
     parameters = parameter_specs(observation_size, action_size, config.network)
     # Workers that collect together share two copies; those that go their own way have one each.
     num_copies = plan.num_workers if config.schedule == "decoupled" else NUM_BUFFERS

@@ -41,6 +41,7 @@ class Actor:
         self.envs = CpuEnvs(self.task, plan.envs_per_worker, config.collect.max_episode_steps)
         self.state: Any = None  # EnvState once the first collection has begun
         self.carry = np.zeros((plan.envs_per_worker, *plan.carry_shape), np.float32)
+        self.stream = config.distributed.process_id * plan.num_workers + index  # no other worker of the run has it
 
     def collect(
         self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], iteration: int, beat: Any
@@ -56,7 +57,7 @@ class Actor:
           beat: called once per environment step.
         """
         num_envs, horizon = self.plan.envs_per_worker, self.plan.steps_per_env
-        rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.index], counter=[0, 0, 0, iteration]))
+        rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.stream], counter=[0, 0, 0, iteration]))
         if self.state is None or self.config.collect.mode == "episodes":
             self.state = self.envs.reset(rng)
         by_env = {

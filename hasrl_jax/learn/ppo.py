@@ -117,6 +117,8 @@ def export_parameters(state: LearnerState, normalize_observations: bool = True) 
     Names: "policy/<name>" and "value/<name>" with the parameter names of `Policy` and `Value`, and, when observations
     are normalised, "normalizer/mean" and "normalizer/std" [O].
     """
+    if jax.process_count() > 1:  # this process's copy
+        state = jax.tree.map(lambda leaf: leaf.addressable_data(0), state)
     mean, std = normalize.mean_std(state.normalizer, normalize_observations)
     flat = {f"policy/{name}": array for name, array in state.policy_params.items()}
     flat |= {f"value/{name}": array for name, array in state.value_params.items()}
