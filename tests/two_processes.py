@@ -70,9 +70,9 @@ def run_command(out: str, *arguments: str) -> int:
     """The training command, which also leaves the learner of its last checkpoint in a file of this process."""
     save = train.save
 
-    def save_here_too(config, directory, progress, learner, env_states) -> None:
-        save(config, directory, progress, learner, env_states)
-        np.savez(out, **leaves(learner))
+    def save_here_too(config, directory, state) -> None:
+        save(config, directory, state)
+        np.savez(out, **leaves(state.learner))
 
     train.save = save_here_too
     return train.main(list(arguments))
