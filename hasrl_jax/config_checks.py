@@ -100,8 +100,9 @@ def check(config: Config) -> None:
         check_number(name, name, value)
     _check_cassie(config.cassie)
     if config.backend != "cpu_pool":
-        devices = f"'sync' or 'overlap' with backend {config.backend}, where collecting and learning share the devices"
-        _require(config.schedule != "decoupled", "schedule", config.schedule, devices)
+        reason = ", where collecting and learning share the devices" if config.backend == "mjx" else ""
+        works = f"'sync' or 'overlap' with backend {config.backend}{reason}; decoupled needs cpu_pool"
+        _require(config.schedule != "decoupled", "schedule", config.schedule, works)
     _check_machines(config)
     if config.task == "cassie" and config.cassie.randomize.enabled:
         scale, timestep_s = config.cassie.randomize.physics_rate_scale, config.physics.timestep_s

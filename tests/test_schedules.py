@@ -155,9 +155,11 @@ def test_log_probs_are_those_of_the_parameters_that_acted(schedule):
     assert seen == {0, 1}
 
 
-def test_decoupling_needs_workers_of_its_own():
-    with pytest.raises(ConfigError, match=r"^schedule: got 'decoupled'; expected 'sync' or 'overlap' with backend mjx"):
-        check(config_module.from_dict({"schedule": "decoupled", "backend": "mjx"}))
+@pytest.mark.parametrize("backend", ["mjx", "ray"])
+def test_decoupling_needs_workers_of_its_own(backend):
+    expected = f"^schedule: got 'decoupled'; expected 'sync' or 'overlap' with backend {backend}"
+    with pytest.raises(ConfigError, match=expected):
+        check(config_module.from_dict({"schedule": "decoupled", "backend": backend}))
 
 
 def lose(number: signal.Signals, count: int) -> Hook:

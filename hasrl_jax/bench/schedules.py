@@ -190,7 +190,10 @@ def tables(figures: dict) -> str:
 
 
 def plot(figures: dict, out: Path) -> None:
-    """Draws the learning curves over environment steps and over seconds: mean, and a band of one deviation."""
+    """Draws the learning curves over environment steps and over seconds: mean, and a band of one deviation.
+
+    A run that has ended keeps its last return, so that slower ones can be drawn to their end.
+    """
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(9, 3.4), layout="constrained")
@@ -201,7 +204,7 @@ def plot(figures: dict, out: Path) -> None:
             known = [[record for record in curve if record["episode_return_train"] is not None] for curve in curves]
             places = [[record[name] for record in curve] for curve in known]
             heights = [[record["episode_return_train"] for record in curve] for curve in known]
-            grid = np.linspace(max(place[0] for place in places), min(place[-1] for place in places), 100)
+            grid = np.linspace(max(place[0] for place in places), max(place[-1] for place in places), 100)
             returns = [np.interp(grid, x, y) for x, y in zip(places, heights, strict=True)]
             mean, deviation = np.mean(returns, axis=0), np.std(returns, axis=0)
             axis.plot(grid, mean, label=schedule)
