@@ -4,6 +4,7 @@ C MuJoCo at 2 kHz, mean action, seeds that no training uses. Every row is a numb
 pelvis below 0.6 m or a tilt above 45 degrees, whatever the policy was trained with. Rows are shared among processes.
 """
 
+import hashlib
 import json
 import logging
 import multiprocessing
@@ -19,7 +20,7 @@ import numpy as np
 from hasrl_jax import gait
 from hasrl_jax.collect.cpu_pool import ONE_THREAD
 from hasrl_jax.collect.numpy_policy import Parameters
-from hasrl_jax.config import Config, available_cores, from_dict
+from hasrl_jax.config import Config, available_cores, from_dict, to_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.evaluate import SETTLE_S, mean_interval, run_episodes, settled_mean, settled_steps, share_interval
 from hasrl_jax.scorecard_page import percent, write_page
@@ -32,7 +33,7 @@ CHANGING_M_S = ((0.0, 1.5), (-0.3, 2.0))  # ranges of the rows whose commands ch
 CHANGE_S = (2.0, 6.0)  # seconds between commands
 PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 PUSH_SPEEDS_M_S = (0.0, 1.0)
-PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 5.0, 1.0, 0.2, 5.0  # walk, random moment within, duration, then survive
+PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 4.0, 1.0, 0.2, 5.0  # walk, random moment within, duration, then survive
 FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
 BATCH = 25  # episodes that one job plays side by side
@@ -58,21 +59,26 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """All rows of a scorecard."""
-    found = []
+    found = [Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N]
     for randomized in (False, True):
         found += [Row("speed", (v, v), randomized=randomized) for v in SPEEDS_M_S]
         at = LATERAL_AT_M_S
         found += [Row("lateral", (at, at), (v, v), randomized) for v in LATERAL_M_S]
         found += [Row("changing", limits, (-0.1, 0.1), randomized) for limits in CHANGING_M_S]
-    found += [Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N]
     return found
 
 
 def row_config(trained: Config, row: Row, seconds: float) -> Config:
-    """`trained` with the commands, disturbances and ends of a row; its clock and networks stay as trained."""
+    """`trained` with the commands, disturbances and ends of a row; its clock and networks stay as trained.
+
+    Episodes of the nominal robot at one forward speed, and those with changing commands, last `seconds`; lateral ones
+    and those of a randomised robot at one speed 20 s at most; pushed ones until 5 s after the push.
+    """
     env_step_s = trained.physics.timestep_s * trained.physics.steps_per_env_step
     if row.kind == "push":
         seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
+    elif row.kind == "lateral" or (row.kind == "speed" and row.randomized):
+        seconds = min(seconds, SHORT_S)
     cassie = {
         "command": {
             "forward_m_s": list(row.forward_m_s),
@@ -102,28 +108,58 @@ def write(
 ) -> None:
     """Measures every policy, the first being the one that the card is about; writes scorecard.json, .md and .png.
 
+    Rows that scorecard.json already holds of the same policies and settings are not measured again.
+
     Args:
       directory: made if missing.
       policies: by name: configuration, with the physics to play under, and parameters.
       episodes, seconds, seed: as in `measure`.
       command: what to type for the same numbers, for the page.
+
+    Raises:
+      OSError: the directory cannot be written.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {"episodes": episodes, "seed": seed, "command": command, "policies": {}}
+    path = directory / "scorecard.json"
+    report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
+    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
     report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
+    earlier = _read(path)
+    same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
     for name, (config, parameters) in policies.items():
-        started, done = time.monotonic(), report["policies"].setdefault(name, [])
-        for row in measure(config, parameters, episodes, seconds, seed):
-            done.append(row)
+        digest, started = _digest(config, parameters), time.monotonic()
+        known = same and earlier.get("digests", {}).get(name) == digest
+        measured = earlier["policies"].get(name, []) if known else []
+        report["digests"][name], report["policies"][name] = digest, measured
+        for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
+            measured.append(row)
+            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
             robot = "randomised" if row["randomized"] else "nominal"
             share, spent = percent(row["share_up"]), time.monotonic() - started
             log.info("%s, %s, %s: %s up, %.0f s so far", name, row["title"], robot, share, spent)
-    (directory / "scorecard.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     write_page(report, directory)
 
 
+def _read(path: Path) -> dict[str, Any]:
+    """An earlier report; empty when there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
+
+
+def _digest(config: Config, parameters: Parameters) -> str:
+    """Tells policies apart, and what they are played under."""
+    digest = hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode())
+    for name in sorted(parameters):
+        digest.update(name.encode() + parameters[name].tobytes())
+    return digest.hexdigest()
+
+
 def measure(
-    trained: Config, parameters: Parameters, episodes: int, seconds: float, seed: int, processes: int = 0
+    trained: Config, parameters: Parameters, episodes: int, seconds: float, seed: int, skip: int = 0
 ) -> Iterator[dict[str, Any]]:
     """Plays the rows and yields each one's results, ready for JSON, in the order of `rows`.
 
@@ -131,18 +167,19 @@ def measure(
       trained: the policy's configuration, with the physics to play under.
       parameters: as `learn.ppo.export_parameters` returns them.
       episodes: per row.
-      seconds: time limit of an episode; pushed episodes last just over eleven.
-      seed: the same seed gives the same numbers, whatever the number of processes.
-      processes: that play at once; 0 takes one per core.
+      seconds: time limit of the longest episodes, see `row_config`.
+      seed: the same seed gives the same numbers, whatever the number of cores.
+      skip: rows to leave out at the beginning.
     """
     jobs = [
         (row, row_config(trained, row, seconds), parameters, min(BATCH, episodes - done), [seed, number, done])
         for number, row in enumerate(rows())
+        if number >= skip
         for done in range(0, episodes, BATCH)
     ]
     os.environ.update(ONE_THREAD)  # the processes inherit it before they load NumPy
     # Fresh interpreters: forking a process that has started JAX can hang.
-    with ProcessPoolExecutor(processes or available_cores(), multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(available_cores(), multiprocessing.get_context("spawn")) as pool:
         parts: list[dict[str, np.ndarray]] = []
         for job, part in zip(jobs, pool.map(_play, jobs), strict=True):
             parts.append(part)
@@ -194,7 +231,7 @@ def summarize_row(row: Row, config: Config, parts: list[dict[str, np.ndarray]]) 
         reached = reached[values["seconds"] > PUSH_AFTER_S]
         result["pushed_episodes"] = len(reached)
     result["share_up"] = share_interval(reached)
-    if cap_s > SHORT_S:
-        result["share_up_20_s"] = share_interval(values["seconds"] >= SHORT_S - 1e-9)
+    if row.kind != "push":
+        result["share_up_20_s"] = share_interval(values["seconds"] >= min(SHORT_S, cap_s) - 1e-9)
     # An episode that fell before the command had settled has no speed error, and one that stands no gait.
     return result | {name: mean_interval(x) for name, x in values.items()}
