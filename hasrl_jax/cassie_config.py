@@ -4,6 +4,7 @@ Every field is read somewhere, and its comment gives its meaning and unit.
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class RewardConfig:
     action_change: float = 0.025  # w8, weight of exp(-A_p)
     velocity_sharpness: float = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
     lateral_velocity_share: float = 1.0  # weight of the lateral speed error in E_v (the paper: 0)
-    height_m: float = 0.9  # pelvis height that P_m asks for, m
+    height_m: float = 0.9  # pelvis height above the ground that P_m asks for, m
     shaking: float = 0.25  # factor on summed |angular velocity| and |acceleration| of the pelvis in P_m
     follow_lateral_command: bool = True  # P_m counts drift from the commanded path (the paper: from y = 0)
 
@@ -63,8 +64,16 @@ class PushConfig:
 
 
 @dataclass(frozen=True)
+class TerrainConfig:
+    kind: Literal["flat", "steps", "rough"] = "flat"  # steps: stairs up, then down; rough: blocks of random heights
+    step_height_m: tuple[float, float] = (-0.1, 0.1)  # rise of every step of an episode; rough: height of each block, m
+    step_depth_m: tuple[float, float] = (0.3, 0.5)  # length of a step or block along x, one draw per episode, m
+    flat_start_m: float = 1.0  # x at which the level ground of the start ends, m
+
+
+@dataclass(frozen=True)
 class TerminationConfig:
-    min_height_m: float = 0.6  # the episode ends when the pelvis is lower (the paper: 0.4)
+    min_height_m: float = 0.6  # the episode ends when the pelvis is lower above the ground (the paper: 0.4)
     max_height_m: float = 3.0  # or higher
     max_tilt_deg: float = 45.0  # or when the pelvis tilts further from upright (the paper: no bound, 180)
 
@@ -76,4 +85,5 @@ class CassieConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
     push: PushConfig = field(default_factory=PushConfig)
+    terrain: TerrainConfig = field(default_factory=TerrainConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)

@@ -23,11 +23,12 @@ SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.a
 OVERRIDABLE_FOR_A_POLICY = ("physics", "cassie")  # what can differ from the training of a policy that is played
 
 
-def parse_train(arguments: list[str]) -> tuple[Config, bool]:
-    """The configuration of a run, and whether it continues one.
+def parse_train(arguments: list[str]) -> tuple[Config, bool, str | None]:
+    """The configuration of a run, whether it continues one, and the policy that it starts from.
 
     `--config FILE` reads a YAML file (default: configs/cassie_walk.yaml), `--resume DIR` the configuration of that
-    run; everything else overrides single fields, `--ppo.clip 0.1`.
+    run; `--init-policy SOURCE` names a policy file, a run directory or "released"; everything else overrides single
+    fields, `--ppo.clip 0.1`.
 
     Raises:
       ConfigError: an impossible value; RunError: `--resume` names no run.
@@ -37,7 +38,10 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
     parser = OneLineParser(prog="python -m hasrl_jax.train", add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path, default=None, metavar="FILE")
     parser.add_argument("--resume", type=Path, default=None, metavar="DIR")
+    parser.add_argument("--init-policy", default=None, metavar="SOURCE")
     known, rest = parser.parse_known_args(arguments)
+    if known.init_policy and known.resume:
+        raise ConfigError("--init-policy and --resume: give one of them; a resumed run goes on with its own policy")
     if known.config and known.resume:
         raise ConfigError("--config and --resume: give one of them; a resumed run brings its own configuration")
     if known.resume and any(_option(argument) == "--run-dir" for argument in rest):
@@ -51,7 +55,7 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool]:
     curriculum.stages(config)  # refuses stages that cannot work
     if known.resume:
         config = config_module.from_dict({"run_dir": str(known.resume)}, config)
-    return config, known.resume is not None
+    return config, known.resume is not None, known.init_policy
 
 
 def override(base: Config, arguments: list[str], program: str) -> Config:
@@ -70,7 +74,8 @@ def override(base: Config, arguments: list[str], program: str) -> Config:
                 default=base,
                 args=arguments,
                 prog=f"python -m hasrl_jax.{program}",
-                description="Train a policy. Also: --config FILE, --resume DIR, --num-workers N.",
+                description="Train a policy. Also: --config FILE, --resume DIR, --num-workers N, "
+                "--init-policy (a policy file, a run directory or released).",
                 config=(tyro.conf.FlagConversionOff,),
             )
     except SystemExit as stopped:

@@ -47,6 +47,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "cassie.push.force_n": (0, 1e5),
     "cassie.push.interval_s": (0, 1e6),
     "cassie.push.duration_s": (0, 1e3),
+    "cassie.terrain.step_height_m": (-0.5, 0.5),
+    "cassie.terrain.step_depth_m": (0.1, 2),
+    "cassie.terrain.flat_start_m": (0.5, 100),  # the feet of the start reach 0.2 m
     "cassie.termination.min_height_m": (0, 1),  # the robot starts at 1.01 m
     "cassie.termination.max_height_m": (1.02, 1e3),
     "cassie.termination.max_tilt_deg": (1, 180),

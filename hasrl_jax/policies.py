@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hasrl_jax import checkpoint, config_checks
@@ -11,7 +12,7 @@ from hasrl_jax.checkpoint import CheckpointError
 from hasrl_jax.collect.numpy_policy import parameter_shapes
 from hasrl_jax.config import Config, ConfigError
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.learn import ppo
+from hasrl_jax.learn import normalize, ppo
 from hasrl_jax.run_directory import CHECKPOINTS_DIRECTORY, load_run_config
 
 RELEASED = Path(__file__).parent / "released" / "cassie_walk.npz"
@@ -64,6 +65,40 @@ def paper_physics(config: Config) -> Config:
     if config.task != "cassie":
         return config
     return config_module.from_dict({"physics": config_module.to_dict(config_module.shipped("paper").physics)}, config)
+
+
+def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
+    """The parameters that a run of `config` starts from, its exploration included.
+
+    Args:
+      source: a policy file, "released", or a run directory.
+
+    Raises:
+      ConfigError: another task or network than the run's; RunError, CheckpointError: as `load_policy_parameters`.
+    """
+    trained, parameters = load_policy_parameters(*((source, None) if Path(source).is_dir() else (None, source)))
+    if trained.task != config.task:
+        raise ConfigError(f"--init-policy {source}: a policy for task {trained.task}; this run's is {config.task}")
+    for name in ("hidden_size", "symmetric", "normalize_observations"):
+        its, ours = getattr(trained.network, name), getattr(config.network, name)
+        if its != ours:
+            raise ConfigError(f"network.{name}: got {ours}; --init-policy {source} needs --network.{name} {its}")
+    return parameters
+
+
+def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]) -> ppo.LearnerState:
+    """`learner` before its first iteration, with what `ppo.export_parameters` returned in place of its own parameters.
+
+    The optimisers stay fresh.
+    """
+
+    def group(name: str) -> dict[str, jax.Array]:
+        return {key.removeprefix(name): jnp.array(x) for key, x in parameters.items() if key.startswith(name)}
+
+    statistics, normalizer = group("normalizer/"), learner.normalizer
+    if statistics:
+        normalizer = normalize.from_mean_std(statistics["mean"], statistics["std"])
+    return learner._replace(policy_params=group("policy/"), value_params=group("value/"), normalizer=normalizer)
 
 
 def policy_metadata(config: Config) -> dict[str, object]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from hasrl_jax import checkpoint, cli, curriculum, distributed
+from hasrl_jax import checkpoint, cli, curriculum, distributed, policies
 from hasrl_jax.collect.cpu_pool import WorkerError
 from hasrl_jax.collectors import Collector, Experience, make_collector, prepare_jax
 from hasrl_jax.config import Config
@@ -54,12 +54,18 @@ class Part(NamedTuple):
     collector: Collector
 
 
-def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.Update] = ppo.make_update) -> None:
+def train(
+    config: Config,
+    resume: bool = False,
+    init_policy: str | None = None,
+    make_update: Callable[..., ppo.Update] = ppo.make_update,
+) -> None:
     """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM, through the stages of its curriculum.
 
     Args:
       config: the run's configuration.
       resume: continue the run in `config.run_dir`.
+      init_policy: a policy file, a run directory or "released", whose parameters a new run starts from.
       make_update: makes the learner's program; benchmarks put another in its place.
     """
     prepare_jax(config)
@@ -67,6 +73,8 @@ def train(config: Config, resume: bool = False, make_update: Callable[..., ppo.U
     reports = config.distributed.process_id == 0
     parts = [prepare(stage, make_update) for stage in curriculum.stages(config)]  # also refuses what cannot work
     learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
+    if init_policy:
+        learner = policies.with_parameters(learner, policies.load_initial(config, init_policy))
     state = RunState(learner)
     with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
         if resume:

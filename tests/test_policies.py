@@ -1,13 +1,16 @@
 """The released policy loads from a fresh install and walks."""
 
+import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from hasrl_jax import evaluate, export, policies, train
-from hasrl_jax.config import ConfigError, from_dict
+from hasrl_jax import cli, evaluate, export, policies, train
+from hasrl_jax.config import ConfigError, from_dict, shipped
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.learn import ppo
 
 
 def test_the_released_policy_walks_at_the_commanded_speed() -> None:
@@ -24,7 +27,7 @@ def test_the_released_policy_walks_at_the_commanded_speed() -> None:
     np.testing.assert_allclose(forward.mean(axis=0), 1.0, atol=0.15)
 
 
-def test_a_run_exports_the_policy_that_it_evaluates(tmp_path: Path) -> None:
+def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "policy.npz"
     small = ["--collect.envs-per-worker", "2", "--collect.env-steps-per-iteration", "256", "--num-workers", "1"]
     config = Path(__file__).parents[1] / "configs" / "cartpole.yaml"
@@ -35,6 +38,51 @@ def test_a_run_exports_the_policy_that_it_evaluates(tmp_path: Path) -> None:
     assert exported.keys() == from_run.keys()
     for name, array in exported.items():
         np.testing.assert_array_equal(array, from_run[name])
+
+    second = tmp_path / "second"
+    arguments[arguments.index(str(run))] = str(second)
+    still = ["--ppo.policy-learning-rate", "1e-12", "--ppo.value-learning-rate", "1e-12", "--seed", "9"]
+    more = ["--init-policy", str(out), "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2", *still]
+    assert train.main([*arguments, *more]) == 0
+    for name, array in policies.load_policy_parameters(second, None)[1].items():
+        # One iteration's observations move statistics that count as a million a little.
+        np.testing.assert_allclose(array, exported[name], atol=1e-2 if "normalizer" in name else 1e-6, err_msg=name)
+    record = json.loads((second / "metrics.jsonl").read_text().splitlines()[0])
+    assert record["iteration"] == 1
+    np.testing.assert_allclose(record["ratio_first"], 1.0, atol=1e-4)
+
+
+def test_a_learner_given_a_policy_acts_as_it_does() -> None:
+    config = shipped("cassie_stairs")
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    released = policies.load_initial(config, "released")
+    given = policies.with_parameters(learner, released)
+    assert jax.tree.structure(given) == jax.tree.structure(learner)
+    for ours, theirs in zip(jax.tree.leaves(given), jax.tree.leaves(learner), strict=True):
+        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+    exported = ppo.export_parameters(given, config.network.normalize_observations)
+    assert exported.keys() == released.keys()
+    for name, array in exported.items():
+        np.testing.assert_allclose(array, released[name], rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"network": {"hidden_size": 32}}, "network.hidden_size: got 32; .* needs --network.hidden_size 64"),
+        ({"network": {"symmetric": False}}, "network.symmetric: got False; .* needs --network.symmetric True"),
+        ({"task": "cartpole"}, "--init-policy released: a policy for task cassie; this run's is cartpole"),
+    ],
+)
+def test_a_policy_of_another_shape_is_refused_in_one_line(changes: dict, named: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{named}$"):
+        policies.load_initial(from_dict(changes, shipped("cassie_stairs")), "released")
+
+
+def test_a_resumed_run_takes_no_other_policy(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--init-policy and --resume"):
+        cli.parse_train(["--resume", str(tmp_path), "--init-policy", "released"])
 
 
 def test_exactly_one_source_is_named() -> None:

@@ -242,7 +242,7 @@ def test_a_checkpoint_of_another_network_size_is_refused(tmp_path, tiny, capsys)
 
 
 def test_without_a_config_file_the_walking_recipe_is_used():
-    assert cli.parse_train([]) == (load_yaml(DEFAULT_CONFIG), False)
+    assert cli.parse_train([]) == (load_yaml(DEFAULT_CONFIG), False, None)
     assert cli.parse_train(["--num-workers=3"])[0].collect.num_workers == 3
 
 

@@ -31,6 +31,7 @@ def make(config: Config) -> Task:
     return Task(
         name="cartpole",
         asset=ASSET,
+        ground=None,
         model=load_model(ASSET, config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=2,

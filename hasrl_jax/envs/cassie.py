@@ -6,11 +6,12 @@ Source: paper section II.A to II.D; constants of the published implementation.
 from functools import partial
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 
 from hasrl_jax.cassie_config import CassieConfig
 from hasrl_jax.config import Config
-from hasrl_jax.envs import clock, commands, randomize, rewards
+from hasrl_jax.envs import clock, commands, randomize, rewards, terrain
 from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
@@ -26,7 +27,7 @@ GRAVITY_M_S2 = 9.81
 MEASURES = (
     *("forward_speed", "lateral_speed"),  # of the pelvis at the end of the environment step, m/s
     *("forward_command", "lateral_command"),  # that held during the environment step, m/s
-    *("height", "heading"),  # of the pelvis at the end of the environment step, m and rad
+    *("height", "heading"),  # of the pelvis, above the ground, at the end of the environment step, m and rad
     *("left_force", "right_force"),  # ground force on each foot, mean over the physics steps, N
     "motor_power",  # sum of |torque * joint velocity| over the motors, mean over the physics steps, W
     "phase",  # of the gait clock by which the environment step was judged, [0, 1)
@@ -43,6 +44,7 @@ class CassieState(NamedTuple):
     push: Array  # [..., 2] force of the next push, world x and y, N
     push_s: Array  # [...] seconds until that push; it acts while this is not positive
     encoder_offset: Array  # [..., 16] of the motors and the passive joints, rad
+    terrain: Array  # [..., K] uniform numbers that the ground was drawn from; K is 0 where it is flat
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
     env_step_s: Array  # [...] duration of an environment step in this episode, s
@@ -54,6 +56,7 @@ class Constants(NamedTuple):
     config: CassieConfig
     ids: CassieIds
     nominal: randomize.Nominal
+    model: mujoco.MjModel  # with the ground as compiled
     start_qpos: np.ndarray  # [35]
     steps_per_env_step: int
     env_step_s: float  # nominal
@@ -61,25 +64,29 @@ class Constants(NamedTuple):
 
 def make(config: Config) -> Task:
     """The task with its model compiled and its names resolved."""
-    model = load_model(ASSET, config.physics)
+    ground = None if config.cassie.terrain.kind == "flat" else partial(terrain.build, config.cassie.terrain)
+    model = load_model(ASSET, config.physics, ground)
     nominal = randomize.nominal(model)
     constants = Constants(
         config=config.cassie,
         ids=cassie_ids(model),
         nominal=nominal,
+        model=model,
         start_qpos=model.key("stand").qpos.copy(),
         steps_per_env_step=config.physics.steps_per_env_step,
         env_step_s=config.physics.timestep_s * config.physics.steps_per_env_step,
     )
     drawn = commands.COMMAND_UNIFORMS + commands.PUSH_UNIFORMS
+    drawn_at_reset = drawn + 2 + NUM_ENCODERS + terrain.num_uniforms(config.cassie.terrain)
     return Task(
         name="cassie",
         asset=ASSET,
+        ground=ground,
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
         observation_size=OBSERVATION_SIZE,
         action_size=ACTION_SIZE,
-        reset_uniforms=randomize.num_uniforms(nominal) + drawn + 2 + NUM_ENCODERS,
+        reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset,
         step_uniforms=drawn,
         reward_terms=rewards.TERMS,
         measures=MEASURES,
@@ -96,8 +103,8 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
-    cuts = np.cumsum([randomize.num_uniforms(nominal), commands.COMMAND_UNIFORMS, commands.PUSH_UNIFORMS, 1, 1])
-    model_u, command_u, push_u, phase_u, start_u, encoder_u = xp.split(uniforms, cuts, axis=-1)
+    sizes = randomize.num_uniforms(nominal), commands.COMMAND_UNIFORMS, commands.PUSH_UNIFORMS, 1, 1, NUM_ENCODERS
+    model_u, command_u, push_u, phase_u, start_u, encoder_u, terrain_u = xp.split(uniforms, np.cumsum(sizes), axis=-1)
 
     fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
@@ -112,6 +119,7 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         push=push,
         push_s=push_s,
         encoder_offset=offset[..., None] * (2 * encoder_u - 1),
+        terrain=terrain_u,
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
@@ -121,6 +129,7 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     qvel = xp.concatenate([start_velocity, xp.zeros((*batch, len(nominal.dof_damping) - 2))], axis=-1)
     # Nothing accelerates yet, so the first observation needs no physics.
     observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), xp)
+    fields |= terrain.model_fields(terrain_u, constants.model, config.terrain, xp)
     return Reset(state, observation, qpos, qvel, fields)
 
 
@@ -161,7 +170,7 @@ def step(
     errors = reward_errors(constants, state, action, reading, acceleration, path_y, xp)
     terms = rewards.weighted_terms(errors, config.reward, xp)
 
-    height = reading.qpos[..., 2]
+    height = height_above_ground(constants, state, reading.qpos, xp)
     limits = config.termination
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
@@ -193,7 +202,8 @@ def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, 
     """The 50 inputs of the policy in the published order, [..., 50]. Source: paper section II.A."""
     ids, offset = constants.ids, state.encoder_offset
     parts = [
-        qpos[..., 2:7],  # pelvis height (m), orientation (w, x, y, z)
+        height_above_ground(constants, state, qpos, xp)[..., None],  # of the pelvis, m
+        qpos[..., 3:7],  # its orientation (w, x, y, z)
         qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
         qvel[..., 0:6],  # pelvis linear velocity (world frame), angular velocity (pelvis frame)
         qvel[..., ids.motor_qvel],
@@ -227,6 +237,7 @@ def reward_errors(
     speed = state.command[..., 0]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
+    height = height_above_ground(constants, state, reading.qpos, xp)
     drift = reading.qpos[..., 1] - (path_y if settings.follow_lateral_command else 0.0)
     pelvis_error = 1.0 - reading.qpos[..., 3] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     velocity_error = xp.abs(reading.qvel[..., :2] - state.command)
@@ -236,7 +247,7 @@ def reward_errors(
         "foot_velocity": rewards.clock_score(-force_clock, foot_speed, rewards.MAX_FOOT_SPEED_M_S, xp),
         "orientation": 10 * pelvis_error + 10 * reading.averages[..., 2:4].sum(axis=-1),
         "pelvis_motion": rewards.pelvis_motion(
-            drift, reading.qpos[..., 2], speed, reading.qvel[..., 3:6], acceleration, settings, xp
+            drift, height, speed, reading.qvel[..., 3:6], acceleration, settings, xp
         ),
         "velocity": settings.velocity_sharpness
         * (velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]),
@@ -244,6 +255,11 @@ def reward_errors(
         "torque_change": 0.25 * torque_change.mean(axis=-1),
         "action_change": 5 * xp.abs(action - state.action).mean(axis=-1),
     }
+
+
+def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
+    """Height of the pelvis above the ground below it, m, [...]; it jumps where the pelvis passes the edge of a step."""
+    return qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, constants.config.terrain, xp)
 
 
 def up_in_body_frame(quat: Array, xp: Any) -> Array:

@@ -123,7 +123,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if config != self._running:
             self._open(config)
         self._state = self._envs.reset(self.np_random)
-        self._physics, self._ended = self._state.physics[0], False
+        self._shown, self._ended = self._state, False
         self._observation = self._state.observation[0].astype(np.float32)
         return self._observation.copy(), {}
 
@@ -147,7 +147,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if not diverged:
             self._observation = result.final_observation[0].astype(np.float32)
         if not self._ended:  # at the end the state is already that of the next episode
-            self._physics = self._state.physics[0]
+            self._shown = self._state
         names = [f"reward/{name}" for name in self.task.reward_terms] + list(self.task.measures)
         values = np.concatenate([result.reward_terms[0], result.measures[0]]).tolist()
         info = dict(zip(names, values, strict=True)) | {"diverged": diverged}
@@ -168,6 +168,10 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer = self._make_renderer()
         renderer, data = self._renderer, self._render_data
         data.qpos[:] = self.qpos
+        if self.task.ground:
+            ground = renderer.model.geom_bodyid == 0  # the first geoms of any model
+            for name in ("geom_pos", "geom_size"):
+                getattr(renderer.model, name)[ground] = self._shown.model_fields[name][0, : ground.sum()]
         mujoco.mj_forward(renderer.model, data)
         renderer.update_scene(data, self._camera)
         return renderer.render()
@@ -217,7 +221,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     @property
     def qpos(self) -> np.ndarray:
         """Positions [nq] of the running episode; after its end, those before its last environment step."""
-        return self._physics[1 : 1 + self.task.model.nq]
+        return self._shown.physics[0, 1 : 1 + self.task.model.nq]
 
     @property
     def step_s(self) -> float:
@@ -250,7 +254,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _make_renderer(self) -> mujoco.Renderer:
         # A model of its own: the one that is simulated has no visual shapes and carries the randomised fields.
-        model = load_model(self.task.asset, self.config.physics, visual=True)
+        model = load_model(self.task.asset, self.config.physics, self.task.ground, visual=True)
         height, width = self.frame_size
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         if self._shadow_px is not None:

@@ -175,6 +175,8 @@ def make_engine(
     Raises:
       ConfigError: a setting that MJX cannot run; names what works.
     """
+    if task.ground is not None:
+        raise ConfigError("cassie.terrain.kind: the mjx backend has level ground only; set it to flat, or use cpu_pool")
     if task.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ConfigError("physics.solver: MJX has no PGS; set it to Newton")
     if impl not in ("jax", "warp"):

@@ -50,6 +50,7 @@ class Task:
 
     name: str
     asset: str  # file of the model in `assets`, for a copy with its visual shapes
+    ground: Callable[[mujoco.MjSpec], None] | None  # puts ground that changes by episode into a copy of the model
     model: mujoco.MjModel  # without visual shapes
     steps_per_env_step: int  # physics steps per environment step
     observation_size: int

@@ -57,7 +57,7 @@ class Live:
 
     Args:
       config: of the policy; its task must be "cassie". The nominal robot is not pushed but by the controls; the
-        randomised one is as `config.cassie.randomize` has it.
+        randomised one is as `config.cassie.randomize` has it. The ground is level, whatever the policy has met.
       parameters: as `learn.ppo.export_parameters` returns them.
       seed: of the environments.
       randomized: the robot of the first episode.
@@ -70,7 +70,8 @@ class Live:
         if config.task != "cassie":
             raise ConfigError(f"the viewer commands speeds, and task {config.task!r} has none; give a policy of cassie")
         longest = LIMITS["collect.max_episode_steps"][1]
-        nominal = from_dict({"collect": {"max_episode_steps": longest}}, undisturbed(config))
+        changes = {"collect": {"max_episode_steps": longest}, "cassie": {"terrain": {"kind": "flat"}}}
+        nominal = from_dict(changes, undisturbed(config))
         drawn = from_dict({"cassie": {"randomize": {"enabled": True, "share": 1.0}}}, nominal)
         self._envs = {False: TaskEnv(nominal), True: TaskEnv(drawn)}
         for env in self._envs.values():
