@@ -157,3 +157,37 @@ def test_the_batch_equals_plain_mujoco() -> None:
         data.ctrl[:] = TASK.control(state.task, action, np)[env]
         mujoco.mj_step(model, data, TASK.steps_per_env_step)
         np.testing.assert_array_equal(after.physics[env], [data.time, *data.qpos, *data.qvel])
+
+
+def test_prepared_episodes_end_with_their_generator() -> None:
+    """What a step draws depends on the state and the generator, not on what the environments did before."""
+    first, second = CpuEnvs(LAYING, 3, 4), CpuEnvs(LAYING, 3, 4)
+    start, _ = _run(first, 3)
+    _run(second, 9, seed=7)  # leaves prepared episodes of another generator
+    second.restore(start)
+    first.restore(start)
+    for a, b in zip(_leaves(_run(first, 5, 1, start)[0]), _leaves(_run(second, 5, 1, start)[0]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    third = CpuEnvs(LAYING, 3, 4)
+    third.restore(start)
+    fresh, _ = third.step(start, np.zeros((3, 10)), np.random.default_rng(5))
+    again, _ = third.step(fresh._replace(episode_step=start.episode_step), np.zeros((3, 10)), np.random.default_rng(5))
+    np.testing.assert_array_equal(fresh.task.phase, again.task.phase)  # equal generators draw equal episodes
+
+
+def test_episodes_that_follow_one_another_differ() -> None:
+    envs = CpuEnvs(LAYING, 2, 1)  # every step ends both episodes, so the prepared ones are used up at once
+    rng, phases = np.random.default_rng(0), []
+    state = envs.reset(rng)
+    for _ in range(4):
+        state, _ = envs.step(state, np.zeros((2, 10)), rng)
+        phases.extend(state.task.phase.tolist())
+    assert len(set(phases)) == len(phases)
+
+
+def test_only_robots_that_differ_have_models_of_their_own() -> None:
+    nominal = make_task(from_dict({"cassie": {"randomize": {"enabled": False}}}))
+    for task, expected in ((nominal, 1), (TASK, 3)):
+        envs = CpuEnvs(task, 3, 100)
+        envs.reset(np.random.default_rng(0))
+        assert len({id(model) for model in envs._models}) == expected
