@@ -184,13 +184,15 @@ class CpuEnvs:
             values[envs] = new[rows]
             return values
 
+        physics = state.physics.copy()  # what the task returned may be a view of it
+        physics[envs] = 0.0
+        physics[envs, 1:] = np.concatenate([fresh.qpos[rows], fresh.qvel[rows]], axis=1)
         # These arrays were made for this state alone.
-        state.physics[envs] = 0.0
-        state.physics[envs, 1:] = np.concatenate([fresh.qpos[rows], fresh.qvel[rows]], axis=1)
         state.is_first[envs], state.episode_step[envs], state.episode_return[envs] = True, 0, 0.0
         for row, env in zip(range(rows.start, rows.stop), envs, strict=True):
             self._write_fields(env, fresh.model_fields, row)
         return state._replace(
+            physics=physics,
             task=type(state.task)(*map(put, state.task, fresh.state)),
             model_fields={name: put(values, fresh.model_fields[name]) for name, values in state.model_fields.items()},
             observation=put(state.observation, fresh.observation),

@@ -66,3 +66,12 @@ def test_mirror_image() -> None:
     _, result = envs.step(state._replace(physics=physics), np.array([[0.3], [-0.3]]), np.random.default_rng(0))
     observation = result.final_observation
     np.testing.assert_allclose(TASK.mirror.observation(observation[1]), observation[0], atol=1e-12)
+
+
+def test_measures_of_a_last_step_are_those_of_the_episode_that_ends() -> None:
+    envs = CpuEnvs(TASK, 4, 1)
+    rng = np.random.default_rng(0)
+    state = envs.reset(rng)
+    _, result = envs.step(state, np.ones((4, 1)), rng)
+    assert result.truncated.all()
+    np.testing.assert_allclose(result.measures[:, 0], result.final_observation[:, 1] / 10)
