@@ -59,25 +59,25 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """All rows of a scorecard."""
-    found = [Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N]
+    found = []
     for randomized in (False, True):
         found += [Row("speed", (v, v), randomized=randomized) for v in SPEEDS_M_S]
-        at = LATERAL_AT_M_S
-        found += [Row("lateral", (at, at), (v, v), randomized) for v in LATERAL_M_S]
         found += [Row("changing", limits, (-0.1, 0.1), randomized) for limits in CHANGING_M_S]
-    return found
+    at = LATERAL_AT_M_S
+    found += [Row("lateral", (at, at), (v, v), randomized) for randomized in (False, True) for v in LATERAL_M_S]
+    return found + [Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N]
 
 
 def row_config(trained: Config, row: Row, seconds: float) -> Config:
     """`trained` with the commands, disturbances and ends of a row; its clock and networks stay as trained.
 
-    Episodes of the nominal robot at one forward speed, and those with changing commands, last `seconds`; lateral ones
-    and those of a randomised robot at one speed 20 s at most; pushed ones until 5 s after the push.
+    Episodes with commands that change over the whole range last `seconds`, others 20 s at most, and pushed ones until
+    5 s after the push.
     """
     env_step_s = trained.physics.timestep_s * trained.physics.steps_per_env_step
     if row.kind == "push":
         seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
-    elif row.kind == "lateral" or (row.kind == "speed" and row.randomized):
+    elif row.forward_m_s != CHANGING_M_S[-1]:
         seconds = min(seconds, SHORT_S)
     cassie = {
         "command": {

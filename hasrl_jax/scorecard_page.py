@@ -8,7 +8,7 @@ Rows = list[dict[str, Any]]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 
 # heading, key, how to write a value
-Column = tuple[str, str, Callable[[dict[str, Any]], str]]
+Column = tuple[str, str, Callable[[Any], str]]
 
 
 def percent(value: dict[str, Any]) -> str:
@@ -32,6 +32,7 @@ def number(digits: int) -> Callable[[dict[str, Any]], str]:
 SURVIVAL: tuple[Column, ...] = (
     ("up 20 s", "share_up_20_s", percent),
     ("up to the end", "share_up", percent),
+    ("which is after", "cap_seconds", lambda value: f"{value:g} s"),
     ("seconds upright", "seconds", number(1)),
     ("speed, m/s", "forward_speed", number(2)),
     ("speed error, m/s", "forward_speed_error", number(3)),
@@ -45,7 +46,7 @@ GAIT: tuple[Column, ...] = (
     ("right foot in the left's cycle", "phase_offset", number(2)),
     ("cost of transport", "cost_of_transport", number(2)),
 )
-SHORT: tuple[Column, ...] = (SURVIVAL[2], SURVIVAL[1], SURVIVAL[3], SURVIVAL[4])
+SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
 
 
 def table(rows: Rows, columns: tuple[Column, ...]) -> str:
