@@ -11,11 +11,17 @@ import warnings
 from typing import Any
 
 from hasrl_jax.collect.cpu_pool import ONE_THREAD, WorkerError
+from hasrl_jax.collect.numpy_policy import blas_variables
 from hasrl_jax.config import ConfigError, RayConfig
 
-ENVIRONMENT = {"env_vars": ONE_THREAD}  # of every worker
 ANSWER_TIMEOUT_S = 10.0
 SPARE_BYTES = 2**27  # of the object store, beyond the data of two iterations
+
+
+def environment(settings: RayConfig) -> dict[str, dict[str, str]]:
+    """Ray's `runtime_env` of every worker; the nodes of a cluster may have other CPUs than this one."""
+    blas = {} if settings.address else {n: v for n, v in blas_variables().items() if n not in os.environ}
+    return {"env_vars": blas | ONE_THREAD}
 
 
 def import_ray(settings: RayConfig) -> Any:
@@ -48,7 +54,7 @@ def connect(ray: Any, settings: RayConfig, num_workers: int, bytes_per_worker: i
     if ray.is_initialized():
         return False
     # Its messages would repeat what the pool says itself.
-    quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "runtime_env": ENVIRONMENT}
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "runtime_env": environment(settings)}
     if settings.address:
         _require_answer(settings.address)
     where: dict[str, Any] = {"address": settings.address or "local"}

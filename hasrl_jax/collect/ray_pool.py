@@ -17,7 +17,7 @@ from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.cpu_pool import MAX_FAILURES, WorkerError
 from hasrl_jax.collect.plan import Plan
-from hasrl_jax.collect.ray_cluster import ENVIRONMENT, connect, import_ray
+from hasrl_jax.collect.ray_cluster import connect, environment, import_ray
 from hasrl_jax.collect.ray_worker import RayWorker
 from hasrl_jax.config import Config, to_dict
 from hasrl_jax.envs.task import Task
@@ -58,8 +58,9 @@ class RayPool:
         self.ray = import_ray(config.ray)
         self._connected = connect(self.ray, config.ray, plan.num_workers, shared_memory.size_of(specs))
         try:
-            options = {"num_cpus": 1, "max_restarts": 0, "scheduling_strategy": "SPREAD", "runtime_env": ENVIRONMENT}
-            self._remote = self.ray.remote(concurrency_groups={HEARTBEAT: 1}, **options)(RayWorker)
+            options = {"num_cpus": 1, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
+            options |= {"concurrency_groups": {HEARTBEAT: 1}, "runtime_env": environment(config.ray)}
+            self._remote = self.ray.remote(**options)(RayWorker)
             for index in range(plan.num_workers):
                 self._spawn(index)
             self._await_all()
