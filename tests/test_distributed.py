@@ -166,9 +166,12 @@ def test_processes_meet():
     ],
 )
 def test_processes_that_do_not_fit_together_are_one_line_each(other, named):
-    first, second, third = meet_all({"num_processes": 3}, {"process_id": 2, "num_processes": 3}, other)
+    short = {"start_timeout_s": 3}
+    first, *others = meet_all({"num_processes": 3}, {"process_id": 2, "num_processes": 3} | short, other | short)
     assert first is not None and named in first
-    assert second is not None and third is not None and "process 0 has given up, and says why" in second
+    for complaint in others:  # the second of them may come after process 0 has left
+        assert complaint is not None
+        assert "process 0 has given up, and says why" in complaint or "process 0 does not listen there" in complaint
 
 
 def test_a_process_that_waits_in_vain_is_one_line():
