@@ -58,14 +58,19 @@ class Row(NamedTuple):
 
 
 def rows() -> list[Row]:
-    """All rows of a scorecard."""
-    found = []
-    for randomized in (False, True):
-        found += [Row("speed", (v, v), randomized=randomized) for v in SPEEDS_M_S]
-        found += [Row("changing", limits, (-0.1, 0.1), randomized) for limits in CHANGING_M_S]
-    at = LATERAL_AT_M_S
-    found += [Row("lateral", (at, at), (v, v), randomized) for randomized in (False, True) for v in LATERAL_M_S]
-    return found + [Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N]
+    """All rows of a scorecard, in the order in which they are measured."""
+    some, most = (
+        tuple(Row("changing", limits, (-0.1, 0.1), drawn) for drawn in (False, True)) for limits in CHANGING_M_S
+    )
+    lateral = (LATERAL_AT_M_S, LATERAL_AT_M_S)
+    return [
+        *(Row("speed", (v, v)) for v in SPEEDS_M_S),
+        *most,
+        *(Row("push", (v, v), push_n=force) for v in reversed(PUSH_SPEEDS_M_S) for force in PUSHES_N),
+        *some,
+        *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
+        *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
+    ]
 
 
 def row_config(trained: Config, row: Row, seconds: float) -> Config:
