@@ -59,15 +59,13 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """All rows of a scorecard, in the order in which they are measured."""
-    some, most = (
-        tuple(Row("changing", limits, (-0.1, 0.1), drawn) for drawn in (False, True)) for limits in CHANGING_M_S
-    )
+    changing = [[Row("changing", limits, (-0.1, 0.1), drawn) for drawn in (False, True)] for limits in CHANGING_M_S]
     lateral = (LATERAL_AT_M_S, LATERAL_AT_M_S)
     return [
         *(Row("speed", (v, v)) for v in SPEEDS_M_S),
-        *most,
+        *changing[1],
         *(Row("push", (v, v), push_n=force) for v in reversed(PUSH_SPEEDS_M_S) for force in PUSHES_N),
-        *some,
+        *changing[0],
         *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
         *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
     ]
