@@ -22,7 +22,7 @@ from hasrl_jax.envs.registry import make_task
 @pytest.fixture
 def make_pool(make_config):
     """`make_pool(**collect)`: a pool that is closed at the end, after which nothing may be left."""
-    shared_before = set(os.listdir("/dev/shm")) if os.path.isdir("/dev/shm") else set()
+    shared_before = named_blocks()
     pools, seen = [], set()
 
     def make(**collect):
@@ -37,8 +37,13 @@ def make_pool(make_config):
     for pool in pools:
         pool.close()
     assert not [process for process in seen if process.is_running() and "collect.worker" in " ".join(process.cmdline())]
-    if shared_before:
-        assert set(os.listdir("/dev/shm")) <= shared_before
+    assert named_blocks() <= shared_before
+
+
+def named_blocks() -> set[str]:
+    """Shared memory with a name; semaphores are other programs', the pool has none."""
+    names = os.listdir("/dev/shm") if os.path.isdir("/dev/shm") else []
+    return {name for name in names if not name.startswith("sem.")}
 
 
 @pytest.fixture
