@@ -15,12 +15,14 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"error: {message.removeprefix('argument ')}\n")
 
 
-def require_writable(option: str, path: Path) -> None:
+def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 
     Raises:
-      ConfigError: there is no such folder, or nothing can be written there.
+      ConfigError: the name has not the `suffix`, there is no such folder, or nothing can be written there.
     """
+    if suffix and path.suffix.lower() != suffix:
+        raise ConfigError(f"{option}: got {path}; expected a name that ends in {suffix}")
     if not path.parent.is_dir():
         raise ConfigError(f"{option}: got {path}; expected a file in a folder that exists, and {path.parent} does not")
     try:

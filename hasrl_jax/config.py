@@ -48,6 +48,11 @@ class PhysicsConfig:
     solver_iterations: int = 4  # constraint solver iterations, at most
     line_search_iterations: int = 8  # line-search iterations per solver iteration, at most
 
+    @property
+    def env_step_s(self) -> float:
+        """Nominal duration of one environment step, seconds."""
+        return self.timestep_s * self.steps_per_env_step
+
 
 @dataclass(frozen=True)
 class NetworkConfig:

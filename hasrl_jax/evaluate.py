@@ -94,19 +94,28 @@ def summarize(episodes: Episodes, task: Task) -> dict[str, Any]:
 
 
 def _speeds(episodes: Episodes, task: Task) -> dict[str, Any]:
-    """Speed, command and their difference after settling, averaged per episode first."""
-    column = {name: episodes.measures[..., index] for index, name in enumerate(task.measures)}
-    settled = settled_steps(column["forward_command"], round(SETTLE_S / task.env_step_s))
+    """What `settled_speeds` gives, over all episodes."""
+    values = settled_speeds(columns(episodes, task), task.env_step_s)
+    settled_episodes = int(np.isfinite(values["forward_speed"]).sum())
+    return {"settled_episodes": settled_episodes, **{name: mean_interval(x) for name, x in values.items()}}
+
+
+def columns(episodes: Episodes, task: Task) -> dict[str, np.ndarray]:
+    """The task's measures by name, [T, N] each."""
+    return {name: episodes.measures[..., index] for index, name in enumerate(task.measures)}
+
+
+def settled_speeds(column: dict[str, np.ndarray], env_step_s: float) -> dict[str, np.ndarray]:
+    """Speed, command and their difference after settling, mean of each episode; [T, N] -> [N], NaN if it never was."""
+    settled = settled_steps(column["forward_command"], round(SETTLE_S / env_step_s))
     error = column["forward_speed"] - column["forward_command"]
     lateral_error = column["lateral_speed"] - column["lateral_command"]
-    signed, lateral_signed = settled_mean(error, settled), settled_mean(lateral_error, settled)
     return {
-        "settled_episodes": int(settled.any(axis=0).sum()),
-        "forward_speed": mean_interval(settled_mean(column["forward_speed"], settled)),
-        "forward_command": mean_interval(settled_mean(column["forward_command"], settled)),
-        "forward_speed_error": mean_interval(np.abs(signed)),
-        "lateral_speed_error": mean_interval(np.abs(lateral_signed)),
-        "forward_speed_error_instantaneous": mean_interval(settled_mean(np.abs(error), settled)),
+        "forward_speed": settled_mean(column["forward_speed"], settled),
+        "forward_command": settled_mean(column["forward_command"], settled),
+        "forward_speed_error": np.abs(settled_mean(error, settled)),
+        "lateral_speed_error": np.abs(settled_mean(lateral_error, settled)),
+        "forward_speed_error_instantaneous": settled_mean(np.abs(error), settled),
     }
 
 
@@ -165,8 +174,8 @@ def evaluate(arguments: list[str]) -> None:
         scorecard.write(known.scorecard, played, known.episodes, known.seconds, known.seed, command)
         return
     config = _to_play(trained, known, rest)
-    env_step_s = config.physics.timestep_s * config.physics.steps_per_env_step
-    config = from_dict({"collect": {"max_episode_steps": max(1, round(known.seconds / env_step_s))}}, config)
+    steps = max(1, round(known.seconds / config.physics.env_step_s))
+    config = from_dict({"collect": {"max_episode_steps": steps}}, config)
     task = make_task(config)
     episodes = run_episodes(config, task, parameters, known.episodes, known.seed, not known.stochastic)
     summary = {"physics_hz": 1 / config.physics.timestep_s, "cap_seconds": known.seconds, "seed": known.seed}

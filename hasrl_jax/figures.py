@@ -154,15 +154,13 @@ def draw(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, help="the PNG; default: NAME.png")
     known = parser.parse_args(arguments)
     out = known.out or Path(f"{known.name}.png")
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"--out: got {out}; expected a name that ends in .png")
     if known.name == "fig3" and len(known.run_dir) > 1:
         raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; fig3 shows one")
     if len(known.run_dir) > len(COLOURS):
         raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; expected at most {len(COLOURS)}")
     if known.labels and len(known.labels) != len(known.run_dir):
         raise ConfigError(f"--labels: got {len(known.labels)}; expected one for each of {len(known.run_dir)} runs")
-    require_writable("--out", out)
+    require_writable("--out", out, ".png")
     names = known.labels or differences([load_run_config(run_dir) for run_dir in known.run_dir])
     FIGURES[known.name]([read_metrics(run_dir) for run_dir in known.run_dir], names).savefig(out, dpi=DPI)
     print(f"{out}: {known.name} of {', '.join(map(str, known.run_dir))}")

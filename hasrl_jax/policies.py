@@ -51,7 +51,7 @@ def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray
       RunError, CheckpointError: as `load_policy_parameters`.
     """
     if name not in ("zero", "random"):
-        return load_policy_parameters(*((name, None) if Path(name).is_dir() else (None, name)))
+        return _from_source(name)
     task = make_task(like)
     learner = ppo.init_learner(like, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
     parameters = ppo.export_parameters(learner, like.network.normalize_observations)
@@ -76,7 +76,7 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
     Raises:
       ConfigError: another task or network than the run's; RunError, CheckpointError: as `load_policy_parameters`.
     """
-    trained, parameters = load_policy_parameters(*((source, None) if Path(source).is_dir() else (None, source)))
+    trained, parameters = _from_source(source)
     if trained.task != config.task:
         raise ConfigError(f"--init-policy {source}: a policy for task {trained.task}; this run's is {config.task}")
     for name in ("hidden_size", "symmetric", "normalize_observations"):
@@ -104,6 +104,11 @@ def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]
 def policy_metadata(config: Config) -> dict[str, object]:
     """What a released policy file must carry besides its parameters."""
     return {"config": config_module.to_dict(config)}
+
+
+def _from_source(source: str) -> tuple[Config, dict[str, np.ndarray]]:
+    """`load_policy_parameters` of a run directory, a file, or "released"."""
+    return load_policy_parameters(*((source, None) if Path(source).is_dir() else (None, source)))
 
 
 def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:

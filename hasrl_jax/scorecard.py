@@ -22,7 +22,7 @@ from hasrl_jax.collect.cpu_pool import ONE_THREAD
 from hasrl_jax.collect.numpy_policy import Parameters
 from hasrl_jax.config import Config, available_cores, from_dict, to_dict
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.evaluate import SETTLE_S, mean_interval, run_episodes, settled_mean, settled_steps, share_interval
+from hasrl_jax.evaluate import columns, mean_interval, run_episodes, settled_speeds, share_interval
 from hasrl_jax.scorecard_page import percent, write_page
 
 log = logging.getLogger("hasrl_jax")
@@ -77,7 +77,6 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
     Episodes with commands that change over the whole range last `seconds`, others 20 s at most, and pushed ones until
     5 s after the push.
     """
-    env_step_s = trained.physics.timestep_s * trained.physics.steps_per_env_step
     if row.kind == "push":
         seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
     elif row.forward_m_s != CHANGING_M_S[-1]:
@@ -98,7 +97,9 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
         },
         "termination": FALL,
     }
-    return from_dict({"cassie": cassie, "collect": {"max_episode_steps": round(seconds / env_step_s)}}, trained)
+    return from_dict(
+        {"cassie": cassie, "collect": {"max_episode_steps": round(seconds / trained.physics.env_step_s)}}, trained
+    )
 
 
 def write(
@@ -196,7 +197,7 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
     _, config, parameters, episodes, seed = job
     task = make_task(config)
     played = run_episodes(config, task, parameters, episodes, seed)
-    column = {name: played.measures[..., index] for index, name in enumerate(task.measures)}
+    column = columns(played, task)
     mass = float(task.model.body_mass.sum())
     figures = gait.describe(
         column["left_force"],
@@ -208,16 +209,12 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
     )
     last = np.maximum(played.episode_length - 1, 0)
     heading = np.unwrap(np.nan_to_num(column["heading"]), axis=0)[last, np.arange(episodes)]
-    settled = settled_steps(column["forward_command"], round(SETTLE_S / task.env_step_s))
-    error = settled_mean(column["forward_speed"] - column["forward_command"], settled)
-    lateral_error = settled_mean(column["lateral_speed"] - column["lateral_command"], settled)
+    speeds = settled_speeds(column, task.env_step_s)
     return {
         "seconds": played.episode_length * task.env_step_s,
         "reached_cap": played.reached_cap,
         "diverged": played.diverged,
-        "forward_speed": settled_mean(column["forward_speed"], settled),
-        "forward_speed_error": np.abs(error),
-        "lateral_speed_error": np.abs(lateral_error),
+        **{name: speeds[name] for name in ("forward_speed", "forward_speed_error", "lateral_speed_error")},
         "heading_drift_deg": np.abs(np.rad2deg(heading)),
         **figures,
     }
@@ -226,7 +223,7 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
 def summarize_row(row: Row, config: Config, parts: list[dict[str, np.ndarray]]) -> dict[str, Any]:
     """One row's figures with 95 % intervals."""
     values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    cap_s = config.collect.max_episode_steps * config.physics.timestep_s * config.physics.steps_per_env_step
+    cap_s = config.collect.max_episode_steps * config.physics.env_step_s
     result: dict[str, Any] = row._asdict() | {"title": row.title, "cap_seconds": cap_s}
     result |= {"episodes": len(values["seconds"]), "diverged": int(values.pop("diverged").sum())}
     reached = values.pop("reached_cap")

@@ -114,6 +114,8 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     rows = policies[policy]
+    walking = select(rows, "speed")
+    commanded = [row["forward_m_s"][0] for row in walking]
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.2), layout="constrained")
     for colour, randomized in zip(COLOURS, (False, True), strict=False):
         chosen = select(rows, "speed", randomized=randomized)
@@ -125,7 +127,7 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
         chosen = select(theirs, "speed")
         speeds = [row["forward_m_s"][0] for row in chosen]
         _curve(axes[0], speeds, [row["share_up_20_s"] for row in chosen], name, colour, scale=100)
-    axes[1].plot(speeds, speeds, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
+    axes[1].plot(commanded, commanded, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
     pushes = select(rows, "push")
     for colour, speed in zip(COLOURS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
         chosen = [row for row in pushes if row["forward_m_s"][0] == speed]
@@ -137,11 +139,9 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
             colour,
             100,
         )
-    walking = select(rows, "speed")
-    speeds = [row["forward_m_s"][0] for row in walking]
-    _curve(axes[3], speeds, [row["step_frequency_hz"] for row in walking], "steps per second", COLOURS[0])
-    _curve(axes[3], speeds, [row["duty_factor"] for row in walking], "duty factor", COLOURS[1])
-    _curve(axes[3], speeds, [row["cost_of_transport"] for row in walking], "cost of transport", COLOURS[2])
+    _curve(axes[3], commanded, [row["step_frequency_hz"] for row in walking], "steps per second", COLOURS[0])
+    _curve(axes[3], commanded, [row["duty_factor"] for row in walking], "duty factor", COLOURS[1])
+    _curve(axes[3], commanded, [row["cost_of_transport"] for row in walking], "cost of transport", COLOURS[2])
     titles = (
         ("stays up 20 s, %", "commanded, m/s"),
         ("speed, m/s", "commanded, m/s"),

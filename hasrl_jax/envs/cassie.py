@@ -74,7 +74,7 @@ def make(config: Config) -> Task:
         model=model,
         start_qpos=model.key("stand").qpos.copy(),
         steps_per_env_step=config.physics.steps_per_env_step,
-        env_step_s=config.physics.timestep_s * config.physics.steps_per_env_step,
+        env_step_s=config.physics.env_step_s,
     )
     drawn = commands.COMMAND_UNIFORMS + commands.PUSH_UNIFORMS
     drawn_at_reset = drawn + 2 + NUM_ENCODERS + terrain.num_uniforms(config.cassie.terrain)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from hasrl_jax import cli
 from hasrl_jax.arguments import OneLineParser, require_writable
-from hasrl_jax.config import ConfigError
 from hasrl_jax.config_checks import check_number
 from hasrl_jax.pictures import gait, rewards
 
@@ -31,9 +30,7 @@ def draw(arguments: list[str]) -> None:
     known, rest = _parse(arguments)
     check_number("--seed", "seed", known.seed)
     out = known.out or Path(f"{known.name}.png")
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"--out: got {out}; expected a name that ends in .png")
-    require_writable("--out", out)
+    require_writable("--out", out, ".png")
     policy = known.policy or (None if known.run_dir else "released")
     config, parameters = load_policy_parameters(known.run_dir, policy)
     config = cli.override_for_policy(paper_physics(config) if known.physics == "paper" else config, rest, "pictures")

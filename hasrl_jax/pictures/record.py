@@ -34,7 +34,7 @@ def record(config: Config, parameters: Parameters, speeds: list[float], seconds:
     """
     if config.task != "cassie":
         raise ConfigError(f"task: the pictures show Cassie's gait, and the policy is of {config.task!r}")
-    steps_each = max(1, round(seconds / (config.physics.timestep_s * config.physics.steps_per_env_step)))
+    steps_each = max(1, round(seconds / config.physics.env_step_s))
     steps = steps_each * len(speeds)
     env = TaskEnv(from_dict({"collect": {"max_episode_steps": steps}}, undisturbed(config)))
     observation, _ = env.reset(seed=seed)
