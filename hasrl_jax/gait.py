@@ -5,8 +5,10 @@ All functions take arrays [T, N]: environment steps by episodes, NaN after an ep
 
 import numpy as np
 
+from hasrl_jax.envs.cassie import GRAVITY_M_S2
+
 CONTACT_N = 30.0  # mean ground force in an environment step above which a foot stands; the robot weighs 327 N
-GRAVITY_M_S2 = 9.81
+MIN_SWING_S = 0.1  # a foot that scuffs the ground sooner than this after it lifted has not landed
 MIN_TOUCHDOWNS = 4  # of a foot, before its rhythm is spoken of
 
 
@@ -15,10 +17,13 @@ def contacts(force: np.ndarray) -> np.ndarray:
     return np.nan_to_num(force) > CONTACT_N
 
 
-def touchdowns(contact: np.ndarray) -> np.ndarray:
-    """Where a foot that swung has landed, [T, N] bool."""
-    landed = np.zeros(contact.shape, bool)
-    landed[1:] = contact[1:] & ~contact[:-1]
+def touchdowns(contact: np.ndarray, step_s: float) -> np.ndarray:
+    """Where a foot has landed that swung for `MIN_SWING_S` or longer, [T, N] bool."""
+    swing = max(1, round(MIN_SWING_S / step_s))
+    landed = contact.copy()
+    landed[:swing] = False
+    for back in range(1, swing + 1):
+        landed[swing:] &= ~contact[swing - back : len(contact) - back]
     return landed
 
 
@@ -42,7 +47,7 @@ def describe(
     valid = np.isfinite(left_force)
     steps = np.maximum(valid.sum(axis=0), 1)
     left, right = contacts(left_force), contacts(right_force)
-    landed_left, landed_right = touchdowns(left), touchdowns(right)
+    landed_left, landed_right = touchdowns(left, step_s), touchdowns(right, step_s)
     enough = np.minimum(landed_left.sum(axis=0), landed_right.sum(axis=0)) >= MIN_TOUCHDOWNS
     rhythm = np.where(enough, 1.0, np.nan)
     duty_left, duty_right = left.sum(axis=0) / steps, right.sum(axis=0) / steps

@@ -28,6 +28,17 @@ def test_an_even_walk() -> None:
     np.testing.assert_allclose(figures["cost_of_transport"], 200 / (WEIGHT_N * 1.25))
 
 
+def test_a_foot_that_scuffs_the_ground_after_it_lifted_has_not_landed() -> None:
+    left, right = _walk(cycle=30, stance=14, shift=15)
+    ones = np.ones(left.shape)
+    lifted = np.flatnonzero(np.diff(left[:, 0]) < 0)
+    scuffing = left.copy()
+    scuffing[lifted + 3] = 0.4 * WEIGHT_N
+    clean, scuffed = (gait.describe(force, right, ones, ones, 33.0, STEP_S) for force in (left, scuffing))
+    assert scuffed["step_frequency_hz"] == clean["step_frequency_hz"]
+    assert scuffed["phase_offset"] == clean["phase_offset"]
+
+
 def test_a_limp_is_seen() -> None:
     left, right = _walk(cycle=20, stance=12, shift=7)
     longer, _ = _walk(cycle=20, stance=16, shift=7)

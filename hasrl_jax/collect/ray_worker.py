@@ -39,10 +39,7 @@ class RayWorker:
             self.last_beat = time.monotonic()
 
         beat()
-        cpu, wall = time.process_time(), time.monotonic()
-        statistics = self.actor.collect(parameters, self.slot, iteration, beat)
-        spent = {"cpu_seconds": time.process_time() - cpu, "seconds": time.monotonic() - wall}
-        return self.slot, statistics | spent
+        return self.slot, self.actor.collect(parameters, self.slot, iteration, beat)
 
     def silent_s(self) -> float:
         """Seconds since the last environment step."""

@@ -46,7 +46,7 @@ class Actor:
     def collect(
         self, parameters: numpy_policy.Parameters, slot: dict[str, np.ndarray], iteration: int, beat: Any
     ) -> dict[str, Any]:
-        """Fills `slot` with `steps_per_env` steps of every environment; returns statistics.
+        """Fills `slot` with `steps_per_env` steps of every environment; returns statistics, with the time it took.
 
         Steps are stored by environment, then time: index = env * steps_per_env + t.
 
@@ -56,6 +56,7 @@ class Actor:
           iteration: selects the random stream, so a resumed run draws the same numbers.
           beat: called once per environment step.
         """
+        cpu_began, began = time.process_time(), time.monotonic()
         num_envs, horizon = self.plan.envs_per_worker, self.plan.steps_per_env
         rng = np.random.Generator(np.random.Philox(key=[self.config.seed, self.stream], counter=[0, 0, 0, iteration]))
         if self.state is None or self.config.collect.mode == "episodes":
@@ -88,6 +89,8 @@ class Actor:
         return {
             "reward_terms": terms,
             "diverged": int((~by_env["mask"]).sum()),
+            "seconds": time.monotonic() - began,
+            "cpu_seconds": time.process_time() - cpu_began,
             "physics_cpu_seconds": physics,
             "inference_cpu_seconds": sums["inference"],
             "environment_cpu_seconds": sums["environment"] - physics,  # observation, reward and reset
@@ -229,10 +232,7 @@ def serve(connection: Connection, descriptor: int) -> None:
         if message["do"] == "collect":
             iteration = message["iteration"]
             parameters, slot = block.parameters[message["parameters"]], block.slots[message["slot"]][index]
-            cpu, wall = time.process_time(), time.monotonic()
-            statistics = actor.collect(parameters, slot, iteration, beat)
-            spent = {"cpu_seconds": time.process_time() - cpu, "seconds": time.monotonic() - wall}
-            reply(connection, statistics | spent)
+            reply(connection, actor.collect(parameters, slot, iteration, beat))
         elif message["do"] == "save":
             connection.send_bytes(actor.save())
         elif message["do"] == "load":
