@@ -134,7 +134,7 @@ def test_the_readout_says_when_it_is_behind(live: Live) -> None:
     live.advance(Controls(reset=True, forward_m_s=0.4))
     rows = dict(readout(live.view(), 0.5))
     assert rows["pace"] == "behind: 50% of real time"
-    assert rows["forward"].endswith("commanded +0.40")
+    assert rows["forward"].endswith("of +0.40 m/s")
     assert dict(readout(live.view(), 1.0))["pace"] == "real time"
 
 

@@ -193,9 +193,9 @@ def readout(view: View, pace: float) -> list[tuple[str, str]]:
     if measures:
         for name in ("forward", "lateral"):
             speed, command = measures[f"{name}_speed"], measures[f"{name}_command"]
-            rows.append((name, f"{speed:+.2f} m/s, commanded {command:+.2f}"))
-        rows.append(("ground force", f"left {measures['left_force']:.0f} N, right {measures['right_force']:.0f} N"))
-        rows.append(("motor power", f"{measures['motor_power']:.0f} W"))
+            rows.append((name, f"{speed:+.2f} of {command:+.2f} m/s"))
+        rows.append(("feet", f"left {measures['left_force']:.0f} N, right {measures['right_force']:.0f} N"))
+        rows.append(("motors", f"{measures['motor_power']:.0f} W"))
     rows.append(("falls", str(view.falls)))
     rows.append(("robot", "randomised" if view.randomized else "nominal"))
     rows.append(("pace", "real time" if pace > 0.95 else f"behind: {pace:.0%} of real time"))
