@@ -29,10 +29,10 @@ log = logging.getLogger("hasrl_jax")
 SPEEDS_M_S = (-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 LATERAL_M_S = (-0.1, 0.1)
 LATERAL_AT_M_S = 0.5  # forward speed of the rows with a lateral command
-CHANGING_M_S = ((0.0, 1.5), (-0.3, 2.0))  # ranges of the rows whose commands change
+CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands change
 CHANGE_S = (2.0, 6.0)  # seconds between commands
 PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
-PUSH_SPEEDS_M_S = (0.0, 1.0)
+PUSH_SPEEDS_M_S = (1.0, 0.0)
 PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 4.0, 1.0, 0.2, 5.0  # walk, random moment within, duration, then survive
 FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
@@ -59,27 +59,24 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """All rows of a scorecard, in the order in which they are measured."""
-    changing = [[Row("changing", limits, (-0.1, 0.1), drawn) for drawn in (False, True)] for limits in CHANGING_M_S]
     lateral = (LATERAL_AT_M_S, LATERAL_AT_M_S)
     return [
         *(Row("speed", (v, v)) for v in SPEEDS_M_S),
-        *changing[1],
-        *(Row("push", (v, v), push_n=force) for v in reversed(PUSH_SPEEDS_M_S) for force in PUSHES_N),
-        *changing[0],
-        *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
+        *(Row("changing", limits, (-0.1, 0.1), drawn) for limits in CHANGING_M_S for drawn in (False, True)),
+        *(Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N),
         *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
+        *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
     ]
 
 
 def row_config(trained: Config, row: Row, seconds: float) -> Config:
     """`trained` with the commands, disturbances and ends of a row; its clock and networks stay as trained.
 
-    Episodes with commands that change over the whole range last `seconds`, others 20 s at most, and pushed ones until
-    5 s after the push.
+    Episodes last `seconds`, those with a lateral command 20 s at most, and pushed ones until 5 s after the push.
     """
     if row.kind == "push":
         seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
-    elif row.forward_m_s != CHANGING_M_S[-1]:
+    elif row.kind == "lateral":
         seconds = min(seconds, SHORT_S)
     cassie = {
         "command": {
@@ -112,7 +109,8 @@ def write(
 ) -> None:
     """Measures every policy, the first being the one that the card is about; writes scorecard.json, .md and .png.
 
-    Rows that scorecard.json already holds of the same policies and settings are not measured again.
+    Rows that scorecard.json already holds of the same policies and settings are not measured again. The card's own
+    policy comes last, it stays up longest; the files are brought up to date after each of its rows.
 
     Args:
       directory: made if missing.
@@ -126,11 +124,12 @@ def write(
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scorecard.json"
     report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
-    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
+    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {name: [] for name in policies}}
     report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
     earlier = _read(path)
     same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
-    for name, (config, parameters) in policies.items():
+    own = next(iter(policies))
+    for name, (config, parameters) in reversed(policies.items()):
         digest, started = _digest(config, parameters), time.monotonic()
         known = same and earlier.get("digests", {}).get(name) == digest
         measured = earlier["policies"].get(name, []) if known else []
@@ -138,6 +137,8 @@ def write(
         for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
             measured.append(row)
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            if name == own:
+                write_page(report, directory)
             robot = "randomised" if row["randomized"] else "nominal"
             share, spent = percent(row["share_up"]), time.monotonic() - started
             log.info("%s, %s, %s: %s up, %.0f s so far", name, row["title"], robot, share, spent)

@@ -50,7 +50,9 @@ SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
 
 
 def table(rows: Rows, columns: tuple[Column, ...]) -> str:
-    """A Markdown table with one line per row; columns that no row has are left out."""
+    """A Markdown table with one line per row, empty without rows; columns that no row has are left out."""
+    if not rows:
+        return ""
     shown = [column for column in columns if any(column[1] in row for row in rows)]
     lines = ["| commanded | " + " | ".join(heading for heading, _, _ in shown) + " |", "|---" * (len(shown) + 1) + "|"]
     for row in rows:
@@ -68,6 +70,24 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
     """Writes scorecard.md and scorecard.png. `report`: as in scorecard.json."""
     (policy, rows), *others = report["policies"].items()
     cap_s = report["seconds"]
+    survival = ("speed", "lateral", "changing")
+    sections = (
+        ("The nominal robot", "", table(select(rows, *survival), SURVIVAL)),
+        ("Dynamics randomisation, the paper's ranges", "", table(select(rows, *survival, randomized=True), SURVIVAL)),
+        (
+            "Gait of the nominal robot",
+            "Contacts are seen once per environment step (25 ms), which makes the duty factor read up to 0.03 high; a "
+            "step is a landing after 0.1 s or more in the air. The cost of transport is the mean sum of |torque × "
+            "velocity| of the motors over weight × speed.\n",
+            table(select(rows, "speed"), GAIT),
+        ),
+        (
+            "Pushes",
+            "A horizontal force on the pelvis for 0.2 s, in a random direction at a random moment of the gait, 4 to "
+            "5 s after the start; survived when the robot is up 5 s later.\n",
+            push_table(select(rows, "push")),
+        ),
+    )
     parts = [
         f"# Scorecard: {policy}\n",
         f"C MuJoCo at {report['physics_hz']:.0f} Hz, mean action, {report['episodes']} episodes a row, seed "
@@ -76,19 +96,10 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         "command. A randomised episode's seconds are nominal ones: its physics rate varies.\n",
         f"`{report['command']}`\n",
         "![Share that stays up, speed, pushes and gait](scorecard.png)\n",
-        "## The nominal robot\n",
-        table(select(rows, "speed", "lateral", "changing"), SURVIVAL),
-        "## Dynamics randomisation, the paper's ranges\n",
-        table(select(rows, "speed", "lateral", "changing", randomized=True), SURVIVAL),
-        "## Gait of the nominal robot\n",
-        "Contacts are seen once per environment step (25 ms), which makes the duty factor read up to 0.03 high. The "
-        "cost of transport is the mean sum of |torque × velocity| of the motors over weight × speed.\n",
-        table(select(rows, "speed"), GAIT),
-        "## Pushes\n",
-        "A horizontal force on the pelvis for 0.2 s, in a random direction at a random moment of the gait, 4 to 5 s "
-        "after the start; survived when the robot is up 5 s later.\n",
-        push_table(select(rows, "push")),
     ]
+    for heading, text, figures in sections:
+        if figures:
+            parts += [f"## {heading}\n", *filter(None, [text]), figures]
     if others:
         parts += ["## The same for others\n", "The nominal robot; they are played under their own gait clock.\n"]
     for name, theirs in others:
@@ -98,11 +109,13 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
 
 
 def push_table(rows: Rows) -> str:
-    """Share that survives, by force and speed."""
+    """Share that survives, by force and speed; empty without rows."""
+    if not rows:
+        return ""
     forces, speeds = sorted({row["push_n"] for row in rows}), sorted({row["forward_m_s"][0] for row in rows})
     lines = ["| commanded | " + " | ".join(f"{force:g} N" for force in forces) + " |", "|---" * (len(forces) + 1) + "|"]
     share = {(row["forward_m_s"][0], row["push_n"]): percent(row["share_up"]) for row in rows}
-    lines += [f"| {v:g} m/s | " + " | ".join(share[v, force] for force in forces) + " |" for v in speeds]
+    lines += [f"| {v:g} m/s | " + " | ".join(share.get((v, force), "–") for force in forces) + " |" for v in speeds]
     return "\n".join(lines) + "\n"
 
 
@@ -152,7 +165,8 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
         axis.set_title(title, fontsize=10)
         axis.set_xlabel(x)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
+        if axis.lines:
+            axis.legend(fontsize=7)
     for axis in (axes[0], axes[2]):
         axis.set_ylim(-3, 103)
     axes[3].set_ylim(bottom=0)

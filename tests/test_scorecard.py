@@ -77,6 +77,7 @@ def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert report["policies"]["zero"][0]["share_up"]["mean"] == 0.0
     page = (tmp_path / "scorecard.md").read_text()
     assert "| 1 m/s | 100 %" in page
+    assert "### zero" in page
     assert (tmp_path / "scorecard.png").stat().st_size > 10_000
 
 
