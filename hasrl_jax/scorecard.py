@@ -124,16 +124,17 @@ def write(
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scorecard.json"
     report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
-    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {name: [] for name in policies}}
+    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
     report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
     earlier = _read(path)
     same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
+    for name, (config, parameters) in policies.items():
+        digest = report["digests"][name] = _digest(config, parameters)
+        known = same and earlier.get("digests", {}).get(name) == digest
+        report["policies"][name] = earlier["policies"].get(name, []) if known else []
     own = next(iter(policies))
     for name, (config, parameters) in reversed(policies.items()):
-        digest, started = _digest(config, parameters), time.monotonic()
-        known = same and earlier.get("digests", {}).get(name) == digest
-        measured = earlier["policies"].get(name, []) if known else []
-        report["digests"][name], report["policies"][name] = digest, measured
+        measured, started = report["policies"][name], time.monotonic()
         for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
             measured.append(row)
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -1,6 +1,7 @@
 """The scorecard: its rows, what each row plays, and a small one through the command line."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,23 @@ def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "| 1 m/s | 100 %" in page
     assert "### zero" in page
     assert (tmp_path / "scorecard.png").stat().st_size > 10_000
+
+
+def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object) -> Iterator[dict]:
+        yield {"title": "", "randomized": False, "share_up": {"mean": None}}
+        raise KeyboardInterrupt
+
+    zero, random = load_baseline("zero", Config()), load_baseline("random", Config())
+    digest = scorecard._digest(*zero)
+    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": {"zero": digest}, "policies": {"zero": ["a row"]}}
+    (tmp_path / "scorecard.json").write_text(json.dumps(report))
+    monkeypatch.setattr(scorecard, "measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        scorecard.write(tmp_path, {"zero": zero, "random": random}, 3, 4.0, 0, "")
+    kept = json.loads((tmp_path / "scorecard.json").read_text())["policies"]
+    assert kept["zero"] == ["a row"]
+    assert len(kept["random"]) == 1
 
 
 @pytest.mark.parametrize(
