@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 Rows = list[dict[str, Any]]
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 # heading, key, how to write a value
 Column = tuple[str, str, Callable[[Any], str]]
@@ -134,12 +134,12 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
         chosen = select(rows, "speed", randomized=randomized)
         label = "randomised" if randomized else "nominal"
         speeds = [row["forward_m_s"][0] for row in chosen]
-        _curve(axes[0], speeds, [row["share_up_20_s"] for row in chosen], label, colour, scale=100)
+        _curve(axes[0], speeds, [row["share_up"] for row in chosen], label, colour, scale=100)
         _curve(axes[1], speeds, [row["forward_speed"] for row in chosen], label, colour)
     for colour, (name, theirs) in zip(COLOURS[2:] * 9, list(policies.items())[1:], strict=False):
         chosen = select(theirs, "speed")
         speeds = [row["forward_m_s"][0] for row in chosen]
-        _curve(axes[0], speeds, [row["share_up_20_s"] for row in chosen], name, colour, scale=100)
+        _curve(axes[0], speeds, [row["share_up"] for row in chosen], name, colour, scale=100)
     axes[1].plot(commanded, commanded, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
     pushes = select(rows, "push")
     for colour, speed in zip(COLOURS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
@@ -156,7 +156,7 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     _curve(axes[3], commanded, [row["duty_factor"] for row in walking], "duty factor", COLOURS[1])
     _curve(axes[3], commanded, [row["cost_of_transport"] for row in walking], "cost of transport", COLOURS[2])
     titles = (
-        ("stays up 20 s, %", "commanded, m/s"),
+        (f"stays up {walking[0]['cap_seconds']:g} s, %" if walking else "stays up, %", "commanded, m/s"),
         ("speed, m/s", "commanded, m/s"),
         ("survives a push of 0.2 s, %", "force, N"),
         ("gait", "commanded, m/s"),
