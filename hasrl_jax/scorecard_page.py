@@ -133,28 +133,18 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     for colour, randomized in zip(COLOURS, (False, True), strict=False):
         chosen = select(rows, "speed", randomized=randomized)
         label = "randomised" if randomized else "nominal"
-        speeds = [row["forward_m_s"][0] for row in chosen]
-        _curve(axes[0], speeds, [row["share_up"] for row in chosen], label, colour, scale=100)
-        _curve(axes[1], speeds, [row["forward_speed"] for row in chosen], label, colour)
+        _curve(axes[0], chosen, "share_up", label, colour, scale=100)
+        _curve(axes[1], chosen, "forward_speed", label, colour)
     for colour, (name, theirs) in zip(COLOURS[2:] * 9, list(policies.items())[1:], strict=False):
-        chosen = select(theirs, "speed")
-        speeds = [row["forward_m_s"][0] for row in chosen]
-        _curve(axes[0], speeds, [row["share_up"] for row in chosen], name, colour, scale=100)
+        _curve(axes[0], select(theirs, "speed"), "share_up", name, colour, scale=100)
     axes[1].plot(commanded, commanded, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
     pushes = select(rows, "push")
     for colour, speed in zip(COLOURS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
         chosen = [row for row in pushes if row["forward_m_s"][0] == speed]
-        _curve(
-            axes[2],
-            [row["push_n"] for row in chosen],
-            [row["share_up"] for row in chosen],
-            f"{speed:g} m/s",
-            colour,
-            100,
-        )
-    _curve(axes[3], commanded, [row["step_frequency_hz"] for row in walking], "steps per second", COLOURS[0])
-    _curve(axes[3], commanded, [row["duty_factor"] for row in walking], "duty factor", COLOURS[1])
-    _curve(axes[3], commanded, [row["cost_of_transport"] for row in walking], "cost of transport", COLOURS[2])
+        _curve(axes[2], chosen, "share_up", f"{speed:g} m/s", colour, scale=100)
+    _curve(axes[3], walking, "step_frequency_hz", "steps per second", COLOURS[0])
+    _curve(axes[3], walking, "duty_factor", "duty factor", COLOURS[1])
+    _curve(axes[3], walking, "cost_of_transport", "cost of transport", COLOURS[2])
     titles = (
         (f"stays up {walking[0]['cap_seconds']:g} s, %" if walking else "stays up, %", "commanded, m/s"),
         ("speed, m/s", "commanded, m/s"),
@@ -174,14 +164,14 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     plt.close(figure)
 
 
-def _curve(
-    axis: Any, x: list[float], values: list[dict[str, Any]], label: str, colour: str, scale: float = 1.0
-) -> None:
-    """A line with its 95 % intervals, through the points that have a value."""
-    points = [(a, v) for a, v in zip(x, values, strict=True) if v["mean"] is not None]
+def _curve(axis: Any, rows: Rows, key: str, label: str, colour: str, scale: float = 1.0) -> None:
+    """A line with its 95 % intervals over the commanded speed or the push, through the rows that have a value."""
+    points = [row for row in rows if row[key]["mean"] is not None]
     if not points:
         return
-    mean = [scale * v["mean"] for _, v in points]
-    low = [max(0.0, m - scale * v["low"]) for m, (_, v) in zip(mean, points, strict=True)]
-    high = [max(0.0, scale * v["high"] - m) for m, (_, v) in zip(mean, points, strict=True)]
-    axis.errorbar([a for a, _ in points], mean, yerr=(low, high), label=label, color=colour, marker="o", markersize=3)
+    x = [row["push_n"] if row["kind"] == "push" else row["forward_m_s"][0] for row in points]
+    values = [row[key] for row in points]
+    mean = [scale * v["mean"] for v in values]
+    low = [max(0.0, scale * (v["mean"] - v["low"])) for v in values]
+    high = [max(0.0, scale * (v["high"] - v["mean"])) for v in values]
+    axis.errorbar(x, mean, yerr=(low, high), label=label, color=colour, marker="o", markersize=3)
