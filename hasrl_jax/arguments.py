@@ -15,6 +15,14 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"error: {message.removeprefix('argument ')}\n")
 
 
+def add_policy_options(parser: argparse.ArgumentParser) -> None:
+    """The options of every program that plays a policy, see `policies.load_policy_parameters`."""
+    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
+    parser.add_argument("--policy", help='a policy file (.npz); without it and a run directory, the "released" one')
+    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
+    parser.add_argument("--seed", type=int, default=0)
+
+
 def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hasrl_jax import cli
 from hasrl_jax.acting import act, start
-from hasrl_jax.arguments import OneLineParser, require_writable
+from hasrl_jax.arguments import OneLineParser, add_policy_options, require_writable
 from hasrl_jax.collect import numpy_policy
 from hasrl_jax.config import Config, ConfigError, from_dict
 from hasrl_jax.config_checks import check_number
@@ -106,15 +106,19 @@ def columns(episodes: Episodes, task: Task) -> dict[str, np.ndarray]:
 
 
 def settled_speeds(column: dict[str, np.ndarray], env_step_s: float) -> dict[str, np.ndarray]:
-    """Speed, command and their difference after settling, mean of each episode; [T, N] -> [N], NaN if it never was."""
+    """Speed, command and their difference after settling, mean of each episode; [T, N] -> [N], NaN if it never was.
+
+    An error is that of the mean speed under a command, its absolute value averaged over the commands of the episode:
+    too fast under one does not make up for too slow under another.
+    """
     settled = settled_steps(column["forward_command"], round(SETTLE_S / env_step_s))
     error = column["forward_speed"] - column["forward_command"]
     lateral_error = column["lateral_speed"] - column["lateral_command"]
     return {
         "forward_speed": settled_mean(column["forward_speed"], settled),
         "forward_command": settled_mean(column["forward_command"], settled),
-        "forward_speed_error": np.abs(settled_mean(error, settled)),
-        "lateral_speed_error": np.abs(settled_mean(lateral_error, settled)),
+        "forward_speed_error": command_error(error, settled),
+        "lateral_speed_error": command_error(lateral_error, settled),
         "forward_speed_error_instantaneous": settled_mean(np.abs(error), settled),
     }
 
@@ -123,6 +127,14 @@ def settled_mean(values: np.ndarray, settled: np.ndarray) -> np.ndarray:
     """Mean of each episode's `values` [T, N] where `settled` [T, N]: [N], NaN for an episode that never settled."""
     counts = settled.sum(axis=0)
     return np.where(counts > 0, np.where(settled, values, 0.0).sum(axis=0) / np.maximum(counts, 1), np.nan)
+
+
+def command_error(error: np.ndarray, settled: np.ndarray) -> np.ndarray:
+    """|mean `error` [T, N]| while each command was `settled` [T, N], mean over the commands of an episode: [N]."""
+    number = np.cumsum(np.diff(settled.astype(np.int8), axis=0, prepend=0) > 0, axis=0)  # of the command, from 1
+    commands = range(1, number.max(initial=1) + 1)
+    errors = np.abs([settled_mean(error, settled & (number == command)) for command in commands])
+    return settled_mean(errors, np.isfinite(errors))
 
 
 def settled_steps(command: np.ndarray, settle_steps: int) -> np.ndarray:
@@ -167,7 +179,8 @@ def evaluate(arguments: list[str]) -> None:
     if known.scorecard:
         from hasrl_jax import scorecard
 
-        name = "the released policy" if known.policy == "released" else Path(known.policy or known.run_dir).name
+        source = known.run_dir or known.policy or "released"
+        name = "the released policy" if source == "released" else Path(source).name
         policies = {name: (trained, parameters)} | {other: load_baseline(other, trained) for other in known.against}
         played = {name: (_to_play(config, known, rest), weights) for name, (config, weights) in policies.items()}
         command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
@@ -188,9 +201,9 @@ def evaluate(arguments: list[str]) -> None:
 
 def _to_play(trained: Config, known: argparse.Namespace, rest: list[str]) -> Config:
     """The configuration of a policy with the physics to play under and the command line's overrides."""
-    from hasrl_jax.policies import paper_physics
+    from hasrl_jax.policies import with_physics
 
-    return cli.override_for_policy(paper_physics(trained) if known.physics == "paper" else trained, rest, "evaluate")
+    return cli.override_for_policy(with_physics(trained, known.physics), rest, "evaluate")
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -201,12 +214,9 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "--cassie.randomize.enabled False",
         allow_abbrev=False,
     )
-    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
-    parser.add_argument("--policy", help='a policy file (.npz), or "released"')
+    add_policy_options(parser)
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, help="time limit of an episode; default 20, of a scorecard 60")
-    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mean")
     parser.add_argument("--json", type=Path, help="write the statistics here")
     parser.add_argument(

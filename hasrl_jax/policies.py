@@ -26,18 +26,17 @@ def load_policy_parameters(
     Args:
       run_dir: a run directory, whose newest whole checkpoint is taken; or None.
       policy: a file of `checkpoint.save_policy` with its configuration under `config`, or "released" for the policy
-        that comes with the package; or None.
+        that comes with the package, which is also what None for both gives.
 
     Raises:
-      ConfigError: not exactly one of the two is given.
+      ConfigError: both are given.
       RunError, CheckpointError: what is named is missing, damaged or of another network.
     """
-    if (run_dir is None) == (policy is None):
-        raise ConfigError("--run-dir and --policy: give exactly one of them")
+    if run_dir is not None and policy is not None:
+        raise ConfigError("--run-dir and --policy: give only one of them")
     if run_dir is not None:
         return _from_run(Path(run_dir))
-    assert policy is not None
-    return _from_file(RELEASED if str(policy) == "released" else Path(policy))
+    return _from_file(RELEASED if policy is None or str(policy) == "released" else Path(policy))
 
 
 def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray]]:
@@ -60,9 +59,9 @@ def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray
     return like, {key: array if key in keep else factor * array for key, array in parameters.items()}
 
 
-def paper_physics(config: Config) -> Config:
-    """`config` with the walking task at the paper's 2 kHz physics; another task as it is."""
-    if config.task != "cassie":
+def with_physics(config: Config, physics: str) -> Config:
+    """`config` with the walking task at the "paper" 2 kHz physics; for "training", or another task, as it is."""
+    if physics == "training" or config.task != "cassie":
         return config
     return config_module.from_dict({"physics": config_module.to_dict(config_module.shipped("paper").physics)}, config)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hasrl_jax import opengl
-from hasrl_jax.arguments import OneLineParser, require_writable
+from hasrl_jax.arguments import OneLineParser, add_policy_options, require_writable
 
 if TYPE_CHECKING:
     from hasrl_jax.config import Config
@@ -177,11 +177,11 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     """
     from hasrl_jax import cli
     from hasrl_jax.envs import gymnasium_env
-    from hasrl_jax.policies import load_policy_parameters
+    from hasrl_jax.policies import load_policy_parameters, with_physics
 
     _check(known)
     config, parameters = load_policy_parameters(known.run_dir, known.policy)
-    config = _config_to_film(config, known)
+    config = _config_to_film(with_physics(config, known.physics), known)
     config = cli.override_for_policy(config, rest, "render")
     strip = _strip(known)
     env = gymnasium_env.TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX)
@@ -238,12 +238,10 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         description="Film a policy. Physics and cassie settings can be overridden: --cassie.randomize.enabled True",
         allow_abbrev=False,
     )
-    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is filmed")
-    parser.add_argument("--policy", type=Path, help='a policy file (.npz), or "released"')
+    add_policy_options(parser)
     parser.add_argument("--out", type=Path, default=Path("policy.mp4"), help="the video")
     parser.add_argument("--strip", type=Path, help="a row of frames as one PNG; default: beside the video")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--forward", type=float, help="commanded forward speed, m/s")
     parser.add_argument("--speeds", type=float, nargs="+", help="instead: several, each for an equal share of the film")
     parser.add_argument("--lateral", type=float, help="commanded speed to the left, m/s")

@@ -131,7 +131,8 @@ def write(
     for name, (config, parameters) in policies.items():
         digest = report["digests"][name] = _digest(config, parameters)
         known = same and earlier.get("digests", {}).get(name) == digest
-        report["policies"][name] = earlier["policies"].get(name, []) if known else []
+        begun = earlier["policies"].get(name, []) if known else []
+        report["policies"][name] = begun if _in_order(begun) else []
     own = next(iter(policies))
     for name, (config, parameters) in reversed(policies.items()):
         measured, started = report["policies"][name], time.monotonic()
@@ -154,6 +155,12 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
+
+
+def _in_order(measured: list[dict[str, Any]]) -> bool:
+    """Whether these are the first of `rows`; those of an older list of rows are not."""
+    found = [(row.get("title"), row.get("randomized")) for row in measured]
+    return found == [(row.title, row.randomized) for row in rows()[: len(measured)]]
 
 
 def _digest(config: Config, parameters: Parameters) -> str:

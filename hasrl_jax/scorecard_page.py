@@ -92,8 +92,9 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         f"# Scorecard: {policy}\n",
         f"C MuJoCo at {report['physics_hz']:.0f} Hz, mean action, {report['episodes']} episodes a row, seed "
         f"{report['seed']}, at most {cap_s:g} s each, from rest. A fall is a pelvis below 0.6 m or a tilt above 45°. "
-        "In brackets and after ±: 95 % intervals. Speed errors are those of an episode's mean speed from 3 s after a "
-        "command. A randomised episode's seconds are nominal ones: its physics rate varies.\n",
+        "In brackets and after ±: 95 % intervals. A speed error is that of the mean speed from 3 s after a command, "
+        "without its sign, averaged over the commands of an episode. A randomised episode's seconds are nominal ones: "
+        "its physics rate varies.\n",
         f"`{report['command']}`\n",
         "![Share that stays up, speed, pushes and gait](scorecard.png)\n",
     ]

@@ -57,6 +57,18 @@ def test_a_step_that_diverged_does_not_count(policy, monkeypatch):
     assert evaluate.summarize(episodes, task)["diverged_episodes"] == 1
 
 
+def test_a_speed_error_does_not_cancel_between_commands():
+    nan = np.nan
+    command = [[1, 1, 1, 2, 2, 2], [1, 1, 1, nan, nan, nan], [1, nan, nan, nan, nan, nan]]  # the last two fall
+    speed = [[0, 1, 1.2, 0, 1.8, 2], [0, 1, 1.3, nan, nan, nan], [0, nan, nan, nan, nan, nan]]
+    column = {"forward_command": np.transpose(command), "forward_speed": np.transpose(speed)}
+    column |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_command"]}
+    speeds = evaluate.settled_speeds(column, env_step_s=evaluate.SETTLE_S)
+    np.testing.assert_allclose(speeds["forward_speed_error"], [0.1, 0.15, nan])
+    np.testing.assert_allclose(speeds["forward_speed"], [1.5, 1.15, nan])
+    np.testing.assert_allclose(speeds["lateral_speed_error"], [0.0, 0.0, nan])
+
+
 def test_the_command_writes_its_summary(policy, tmp_path, capsys):
     arguments = ["--policy", str(policy), "--episodes", "2", "--seconds", "0.5", "--json", str(tmp_path / "out.json")]
     assert evaluate.main([*arguments, "--physics.solver-iterations", "8"]) == 0

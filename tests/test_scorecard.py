@@ -87,15 +87,18 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
         yield {"title": "", "randomized": False, "share_up": {"mean": None}}
         raise KeyboardInterrupt
 
-    zero, random = load_baseline("zero", Config()), load_baseline("random", Config())
-    digest = scorecard._digest(*zero)
-    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": {"zero": digest}, "policies": {"zero": ["a row"]}}
+    zero, other, random = (load_baseline(name, Config()) for name in ("zero", "zero", "random"))
+    digests = {"zero": scorecard._digest(*zero), "other": scorecard._digest(*other)}
+    first, second = ({"title": row.title, "randomized": row.randomized} for row in scorecard.rows()[:2])
+    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": digests}
+    report["policies"] = {"zero": [first, second], "other": [second]}
     (tmp_path / "scorecard.json").write_text(json.dumps(report))
     monkeypatch.setattr(scorecard, "measure", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        scorecard.write(tmp_path, {"zero": zero, "random": random}, 3, 4.0, 0, "")
+        scorecard.write(tmp_path, {"zero": zero, "other": other, "random": random}, 3, 4.0, 0, "")
     kept = json.loads((tmp_path / "scorecard.json").read_text())["policies"]
-    assert kept["zero"] == ["a row"]
+    assert kept["zero"] == [first, second]
+    assert kept["other"] == []  # its rows are not the first of today's, so they are measured anew
     assert len(kept["random"]) == 1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hasrl_jax import cli
-from hasrl_jax.arguments import OneLineParser, require_writable
+from hasrl_jax.arguments import OneLineParser, add_policy_options, require_writable
 from hasrl_jax.config_checks import check_number
 from hasrl_jax.pictures import gait, rewards
 
@@ -25,15 +25,14 @@ def draw(arguments: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy.
     """
-    from hasrl_jax.policies import load_policy_parameters, paper_physics
+    from hasrl_jax.policies import load_policy_parameters, with_physics
 
     known, rest = _parse(arguments)
     check_number("--seed", "seed", known.seed)
     out = known.out or Path(f"{known.name}.png")
     require_writable("--out", out, ".png")
-    policy = known.policy or (None if known.run_dir else "released")
-    config, parameters = load_policy_parameters(known.run_dir, policy)
-    config = cli.override_for_policy(paper_physics(config) if known.physics == "paper" else config, rest, "pictures")
+    config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    config = cli.override_for_policy(with_physics(config, known.physics), rest, "pictures")
     save(DRAWINGS[known.name](config, parameters, known.seed), out)
     print(f"{out}: {known.name}")
 
@@ -55,10 +54,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         allow_abbrev=False,
     )
     parser.add_argument("name", choices=tuple(DRAWINGS), help="gait: contacts and forces; rewards: every term")
-    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is drawn")
-    parser.add_argument("--policy", help='a policy file (.npz); default: "released"')
-    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
-    parser.add_argument("--seed", type=int, default=0)
+    add_policy_options(parser)
     parser.add_argument("--out", type=Path, help="the PNG; default: NAME.png")
     return parser.parse_known_args(arguments)
 

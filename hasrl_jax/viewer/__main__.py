@@ -4,10 +4,9 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from hasrl_jax import cli
-from hasrl_jax.arguments import OneLineParser
+from hasrl_jax.arguments import OneLineParser, add_policy_options
 from hasrl_jax.config import ConfigError
 from hasrl_jax.config_checks import check_number
 from hasrl_jax.viewer import browser, native
@@ -20,7 +19,7 @@ def view(arguments: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument, or nothing to show it with; RunError, CheckpointError: no policy.
     """
-    from hasrl_jax.policies import load_policy_parameters, paper_physics
+    from hasrl_jax.policies import load_policy_parameters, with_physics
 
     known, rest = _parse(arguments)
     check_number("--seed", "seed", known.seed)
@@ -31,9 +30,8 @@ def view(arguments: list[str]) -> None:
     else:
         browser.require_viser()
         browser.free_port(known.port)
-    policy = known.policy or (None if known.run_dir else "released")
-    config, parameters = load_policy_parameters(known.run_dir, policy)
-    config = cli.override_for_policy(paper_physics(config) if known.physics == "paper" else config, rest, "viewer")
+    config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    config = cli.override_for_policy(with_physics(config, known.physics), rest, "viewer")
     live = Live(config, parameters, known.seed, known.randomized)
     if known.native:
         native.show(live, known.randomized)
@@ -63,10 +61,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "overridden: --cassie.randomize.mass-scale 0.8 1.2",
         allow_abbrev=False,
     )
-    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is shown")
-    parser.add_argument("--policy", help='a policy file (.npz); default: "released"')
-    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
-    parser.add_argument("--seed", type=int, default=0)
+    add_policy_options(parser)
     parser.add_argument("--randomized", action="store_true", help="begin with a randomised robot")
     parser.add_argument("--port", type=int, default=8080, help="of the page on 127.0.0.1; 0 takes a free one")
     parser.add_argument("--native", action="store_true", help="MuJoCo's own window instead of the browser")
