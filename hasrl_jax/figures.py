@@ -92,7 +92,7 @@ def fig4(runs: list[Series], names: list[str]) -> "Figure":
             axis.plot(run["iteration"], run[metric], color=colour, linewidth=0.4, alpha=0.4)
             axis.plot(run["iteration"], moving_mean(run[metric]), color=colour, linewidth=1.2, label=name)
     axes[0].axhline(1.0, color="grey", linewidth=0.6)
-    axes[0].legend(fontsize=7)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=7)
     _label(axes[0], "(a) mean ratio", "iteration")
     _label(axes[1], "(b) episode return in training", "iteration")
     return figure
@@ -126,7 +126,7 @@ FIGURES = {"fig3": fig3, "fig4": fig4, "curve": curve}
 def _axes(number: int) -> tuple["Figure", list["Axes"]]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.4 * number, 2.8), layout="constrained")
+    figure = Figure(figsize=(3.4 * number, 3.0), layout="constrained")
     return figure, list(figure.subplots(1, number, squeeze=False)[0])
 
 
