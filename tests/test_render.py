@@ -140,7 +140,7 @@ def test_caption() -> None:
         (["--speeds", "0", "nan"], "--speeds"),
         (["--speeds", "0", "11"], "--speeds"),
         (["--speeds", "1", "--forward", "1"], "--forward"),
-        ([], "--run-dir"),
+        (["--run-dir", "run", "--policy", "released"], "--run-dir"),
     ],
 )
 def test_bad_arguments_name_the_field(arguments: list[str], field: str) -> None:
