@@ -43,8 +43,8 @@ def stages(config: Config) -> list[Stage]:
 
 def _parse(text: str, name: str) -> tuple[int, list[tuple[str, Any]]]:
     """The environment steps and the (dotted field, value) pairs of an entry."""
-    first, *settings = text.split()
     try:
+        first, *settings = text.split()
         at = int(float(first))
         pairs = [(field, yaml.safe_load(value)) for field, _, value in (setting.partition("=") for setting in settings)]
     except (ValueError, OverflowError, yaml.YAMLError):

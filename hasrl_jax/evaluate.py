@@ -20,6 +20,7 @@ from hasrl_jax.envs.task import Task
 
 SETTLE_S = 3.0  # the speed error counts from this long after an episode's start or a new command
 MAX_SECONDS = 3600.0
+MIN_SCORECARD_S = 4.0  # a second more than a speed takes to settle
 
 
 class Episodes(NamedTuple):
@@ -108,10 +109,12 @@ def columns(episodes: Episodes, task: Task) -> dict[str, np.ndarray]:
 def settled_speeds(column: dict[str, np.ndarray], env_step_s: float) -> dict[str, np.ndarray]:
     """Speed, command and their difference after settling, mean of each episode; [T, N] -> [N], NaN if it never was.
 
-    An error is that of the mean speed under a command, its absolute value averaged over the commands of the episode:
-    too fast under one does not make up for too slow under another.
+    An error is that of the mean speed under a command, without its sign, averaged over the time under each: too fast
+    under one does not make up for too slow under another.
     """
-    settled = settled_steps(column["forward_command"], round(SETTLE_S / env_step_s))
+    settle_steps = round(SETTLE_S / env_step_s)
+    settled = settled_steps(column["forward_command"], settle_steps)
+    settled &= settled_steps(column["lateral_command"], settle_steps)
     error = column["forward_speed"] - column["forward_command"]
     lateral_error = column["lateral_speed"] - column["lateral_command"]
     return {
@@ -130,11 +133,12 @@ def settled_mean(values: np.ndarray, settled: np.ndarray) -> np.ndarray:
 
 
 def command_error(error: np.ndarray, settled: np.ndarray) -> np.ndarray:
-    """|mean `error` [T, N]| while each command was `settled` [T, N], mean over the commands of an episode: [N]."""
+    """|mean `error`| while each command was `settled`, weighted by its time; [T, N] -> [N], NaN without any."""
     number = np.cumsum(np.diff(settled.astype(np.int8), axis=0, prepend=0) > 0, axis=0)  # of the command, from 1
-    commands = range(1, number.max(initial=1) + 1)
-    errors = np.abs([settled_mean(error, settled & (number == command)) for command in commands])
-    return settled_mean(errors, np.isfinite(errors))
+    steps = [settled & (number == command) for command in range(1, number.max(initial=0) + 1)]
+    total = sum((np.abs(np.where(held, error, 0.0).sum(axis=0)) for held in steps), np.zeros(error.shape[1]))
+    counts = settled.sum(axis=0)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
 
 def settled_steps(command: np.ndarray, settle_steps: int) -> np.ndarray:
@@ -179,6 +183,7 @@ def evaluate(arguments: list[str]) -> None:
     if known.scorecard:
         from hasrl_jax import scorecard
 
+        scorecard.refuse_settings(rest)
         source = known.run_dir or known.policy or "released"
         name = "the released policy" if source == "released" else Path(source).name
         policies = {name: (trained, parameters)} | {other: load_baseline(other, trained) for other in known.against}
@@ -237,6 +242,8 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     for option in ("json", "stochastic"):
         if known.scorecard and getattr(known, option):
             raise ConfigError(f"--scorecard: writes its own files of the mean action; leave out --{option}")
+    if known.scorecard and known.seconds < MIN_SCORECARD_S:
+        raise ConfigError(f"--seconds: got {known.seconds:g}; expected at least {MIN_SCORECARD_S:g} for a --scorecard")
     if known.against and not known.scorecard:
         raise ConfigError("--against: only a --scorecard compares policies")
     return known, rest

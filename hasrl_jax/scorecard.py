@@ -20,7 +20,7 @@ import numpy as np
 from hasrl_jax import gait
 from hasrl_jax.collect.cpu_pool import ONE_THREAD
 from hasrl_jax.collect.numpy_policy import Parameters
-from hasrl_jax.config import Config, available_cores, from_dict, to_dict
+from hasrl_jax.config import Config, ConfigError, available_cores, from_dict, to_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.evaluate import columns, mean_interval, run_episodes, settled_speeds, share_interval
 from hasrl_jax.scorecard_page import percent, write_page
@@ -33,9 +33,18 @@ CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands c
 CHANGE_S = (2.0, 6.0)  # seconds between commands
 PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 PUSH_SPEEDS_M_S = (1.0, 0.0)
-PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 4.0, 1.0, 0.2, 5.0  # walk, random moment within, duration, then survive
+PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 6.0, 1.0, 0.2, 5.0  # walk, random moment within, duration, then survive
 FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
+SETTINGS = (
+    "command",
+    "push",
+    "terrain",
+    "termination",
+    "randomize.enabled",
+    "randomize.share",
+)  # a row's own, of cassie
+REVISION = 2  # of what a row plays and what its figures mean; those of an earlier one are measured anew
 BATCH = 25  # episodes that one job plays side by side
 
 
@@ -92,6 +101,7 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
             "interval_s": [PUSH_AFTER_S, PUSH_AFTER_S + PUSH_PHASE_S],
             "duration_s": PUSH_S,
         },
+        "terrain": {"kind": "flat"},
         "termination": FALL,
     }
     return from_dict(
@@ -114,13 +124,16 @@ def write(
 
     Args:
       directory: made if missing.
-      policies: by name: configuration, with the physics to play under, and parameters.
+      policies: by name: configuration, with the physics to play under, and parameters; all of the walking task.
       episodes, seconds, seed: as in `measure`.
       command: what to type for the same numbers, for the page.
 
     Raises:
-      OSError: the directory cannot be written.
+      ConfigError: a policy of another task; OSError: the directory cannot be written.
     """
+    for name, (config, _) in policies.items():
+        if config.task != "cassie":
+            raise ConfigError(f"--scorecard: {name} is of task {config.task}; only policies that walk have one")
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scorecard.json"
     report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
@@ -129,10 +142,9 @@ def write(
     earlier = _read(path)
     same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
     for name, (config, parameters) in policies.items():
-        digest = report["digests"][name] = _digest(config, parameters)
+        digest = report["digests"][name] = _digest(config, parameters, seconds)
         known = same and earlier.get("digests", {}).get(name) == digest
-        begun = earlier["policies"].get(name, []) if known else []
-        report["policies"][name] = begun if _in_order(begun) else []
+        report["policies"][name] = earlier["policies"].get(name, []) if known else []
     own = next(iter(policies))
     for name, (config, parameters) in reversed(policies.items()):
         measured, started = report["policies"][name], time.monotonic()
@@ -157,15 +169,22 @@ def _read(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
 
 
-def _in_order(measured: list[dict[str, Any]]) -> bool:
-    """Whether these are the first of `rows`; those of an older list of rows are not."""
-    found = [(row.get("title"), row.get("randomized")) for row in measured]
-    return found == [(row.title, row.randomized) for row in rows()[: len(measured)]]
+def refuse_settings(arguments: list[str]) -> None:
+    """Refuses overrides of what the rows set themselves.
+
+    Raises:
+      ConfigError: there is one.
+    """
+    for argument in arguments:
+        option = argument.partition("=")[0].replace("_", "-")
+        if option.startswith(tuple(f"--cassie.{setting}" for setting in SETTINGS)):
+            raise ConfigError(f"{option}: a scorecard sets it for each of its rows; leave it out")
 
 
-def _digest(config: Config, parameters: Parameters) -> str:
+def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
     """Tells policies apart, and what they are played under."""
-    digest = hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode())
+    played = [to_dict(row_config(config, row, seconds)) for row in rows()]
+    digest = hashlib.sha256(json.dumps([REVISION, played], sort_keys=True).encode())
     for name in sorted(parameters):
         digest.update(name.encode() + parameters[name].tobytes())
     return digest.hexdigest()

@@ -83,8 +83,8 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         ),
         (
             "Pushes",
-            "A horizontal force on the pelvis for 0.2 s, in a random direction at a random moment of the gait, 4 to "
-            "5 s after the start; survived when the robot is up 5 s later.\n",
+            "A horizontal force on the pelvis for 0.2 s, in a random direction at a random moment of the gait, 6 to "
+            "7 s after the start; survived when the robot is up 5 s later.\n",
             push_table(select(rows, "push")),
         ),
     )
@@ -93,8 +93,8 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         f"C MuJoCo at {report['physics_hz']:.0f} Hz, mean action, {report['episodes']} episodes a row, seed "
         f"{report['seed']}, at most {cap_s:g} s each, from rest. A fall is a pelvis below 0.6 m or a tilt above 45°. "
         "In brackets and after ±: 95 % intervals. A speed error is that of the mean speed from 3 s after a command, "
-        "without its sign, averaged over the commands of an episode. A randomised episode's seconds are nominal ones: "
-        "its physics rate varies.\n",
+        "without its sign, averaged over an episode's commands by their time. A randomised episode's seconds are "
+        "nominal ones: its physics rate varies.\n",
         f"`{report['command']}`\n",
         "![Share that stays up, speed, pushes and gait](scorecard.png)\n",
     ]

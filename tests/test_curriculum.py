@@ -36,6 +36,7 @@ def test_without_stages_there_is_one() -> None:
     ("stages", "message"),
     [
         (["soon cassie.push.force_n=[0,1]"], r"stages\[0\]: got 'soon .*expected \"STEPS"),
+        ([""], r"stages\[0\]: got ''; expected"),
         (["100"], r"stages\[0\]: got '100'; expected"),
         (["100 cassie.push.force_n"], r"stages\[0\]: got .*; expected"),
         (["100 network.hidden_size=4"], r"stages\[0\]: network.hidden_size cannot change during a run"),

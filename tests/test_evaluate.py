@@ -59,14 +59,19 @@ def test_a_step_that_diverged_does_not_count(policy, monkeypatch):
 
 def test_a_speed_error_does_not_cancel_between_commands():
     nan = np.nan
-    command = [[1, 1, 1, 2, 2, 2], [1, 1, 1, nan, nan, nan], [1, nan, nan, nan, nan, nan]]  # the last two fall
-    speed = [[0, 1, 1.2, 0, 1.8, 2], [0, 1, 1.3, nan, nan, nan], [0, nan, nan, nan, nan, nan]]
+    command = [[1, 1, 1, 1, 2, 2], [1, 1, 1, nan, nan, nan], [1, nan, nan, nan, nan, nan]]  # the last two fall
+    speed = [[0, 1, 1.2, 1.1, 0, 1.6], [0, 1, 1.3, nan, nan, nan], [0, nan, nan, nan, nan, nan]]
+    still = np.where(np.isfinite(np.transpose(command)), 0.0, nan)
     column = {"forward_command": np.transpose(command), "forward_speed": np.transpose(speed)}
-    column |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_command"]}
+    column |= {"lateral_command": still, "lateral_speed": still}
     speeds = evaluate.settled_speeds(column, env_step_s=evaluate.SETTLE_S)
-    np.testing.assert_allclose(speeds["forward_speed_error"], [0.1, 0.15, nan])
-    np.testing.assert_allclose(speeds["forward_speed"], [1.5, 1.15, nan])
+    np.testing.assert_allclose(speeds["forward_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
+    np.testing.assert_allclose(speeds["forward_speed"], [1.225, 1.15, nan])
     np.testing.assert_allclose(speeds["lateral_speed_error"], [0.0, 0.0, nan])
+    swapped = {"forward_command": still, "forward_speed": still}
+    swapped |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_speed"]}
+    speeds = evaluate.settled_speeds(swapped, env_step_s=evaluate.SETTLE_S)
+    np.testing.assert_allclose(speeds["lateral_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
 
 
 def test_the_command_writes_its_summary(policy, tmp_path, capsys):
@@ -100,6 +105,7 @@ def test_cassie_is_judged_with_the_physics_of_the_paper(tmp_path, monkeypatch):
     [
         (["--network.hidden-size", "16"], "network"),
         (["--task", "cassie"], "task"),
+        (["--scorecard", "card"], "is of task cartpole"),
         (["--backend", "mjx"], "backend"),
         (["--collect.unroll-length", "3"], "collect"),
         (["--seconds", "nan"], "--seconds"),

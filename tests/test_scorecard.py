@@ -9,6 +9,7 @@ import pytest
 
 from hasrl_jax import evaluate, scorecard
 from hasrl_jax.config import Config, shipped
+from hasrl_jax.envs.commands import PUSH_UNIFORMS, draw_push, next_push
 from hasrl_jax.policies import load_baseline
 from hasrl_jax.scorecard import Row
 
@@ -34,14 +35,29 @@ def test_a_row_sets_the_task_and_keeps_the_policy_s_own_clock() -> None:
     assert config.collect.max_episode_steps == 2400
     push = scorecard.row_config(trained, Row("push", (1.0, 1.0), push_n=150.0), 60.0)
     assert push.cassie.push.force_n == (150, 150)
-    assert push.collect.max_episode_steps == 408  # 4 s, up to 1 s more, the push, and 5 s to survive
+    assert push.collect.max_episode_steps == 488  # 6 s, up to 1 s more, the push, and 5 s to survive
+    stairs = scorecard.row_config(shipped("cassie_stairs"), Row("speed", (1.0, 1.0)), 60.0)
+    assert stairs.cassie.terrain.kind == "flat"
+
+
+def test_an_episode_meets_one_push() -> None:
+    config = scorecard.row_config(Config(), Row("push", (1.0, 1.0), push_n=150.0), 60.0)
+    settings, step_s = config.cassie.push, config.physics.env_step_s
+    rng = np.random.default_rng(0)
+    push, push_s = draw_push(rng.random((200, PUSH_UNIFORMS)), settings, np)
+    pushed = []
+    for _ in range(config.collect.max_episode_steps):
+        push, push_s = next_push(push, push_s, np.full(200, step_s), rng.random((200, PUSH_UNIFORMS)), settings, np)
+        pushed.append((push_s <= 0) & (push_s > -settings.duration_s))
+    begins = np.diff(np.array(pushed).astype(int), axis=0, prepend=0) > 0
+    np.testing.assert_array_equal(begins.sum(axis=0), 1)
 
 
 def test_pushed_episodes_are_those_up_at_the_push() -> None:
     row = Row("push", (1.0, 1.0), push_n=150.0)
     nothing = np.full(4, np.nan)
     part = {
-        "seconds": np.array([2.0, 5.5, 11.2, 11.2]),
+        "seconds": np.array([2.0, 7.5, 12.2, 12.2]),
         "reached_cap": np.array([False, False, True, True]),
         "diverged": np.zeros(4, bool),
         "forward_speed": nothing,
@@ -87,18 +103,15 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
         yield {"title": "", "randomized": False, "share_up": {"mean": None}}
         raise KeyboardInterrupt
 
-    zero, other, random = (load_baseline(name, Config()) for name in ("zero", "zero", "random"))
-    digests = {"zero": scorecard._digest(*zero), "other": scorecard._digest(*other)}
-    first, second = ({"title": row.title, "randomized": row.randomized} for row in scorecard.rows()[:2])
-    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": digests}
-    report["policies"] = {"zero": [first, second], "other": [second]}
+    zero, random = load_baseline("zero", Config()), load_baseline("random", Config())
+    digest = scorecard._digest(*zero, seconds=4.0)
+    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": {"zero": digest}, "policies": {"zero": ["a row"]}}
     (tmp_path / "scorecard.json").write_text(json.dumps(report))
     monkeypatch.setattr(scorecard, "measure", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        scorecard.write(tmp_path, {"zero": zero, "other": other, "random": random}, 3, 4.0, 0, "")
+        scorecard.write(tmp_path, {"zero": zero, "random": random}, 3, 4.0, 0, "")
     kept = json.loads((tmp_path / "scorecard.json").read_text())["policies"]
-    assert kept["zero"] == [first, second]
-    assert kept["other"] == []  # its rows are not the first of today's, so they are measured anew
+    assert kept["zero"] == ["a row"]
     assert len(kept["random"]) == 1
 
 
@@ -108,6 +121,8 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
         (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
         (["--against", "zero"], "--against: only a --scorecard compares policies"),
         (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
+        (["--scorecard", "DIR", "--seconds", "2"], "--seconds: got 2; expected at least 4"),
+        (["--scorecard", "DIR", "--cassie.push.force-n", "0", "9"], "--cassie.push.force-n: a scorecard sets it"),
     ],
 )
 def test_bad_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
