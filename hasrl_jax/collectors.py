@@ -293,6 +293,6 @@ def prepare_jax(config: Config) -> None:
     if config.backend == "mjx" and jax.default_backend() == "cpu":
         log.warning(
             "the mjx backend has no accelerator here: one CPU core runs about 530 environment steps/s with MJX and "
-            "about 3,300 with --backend=cpu_pool; NPROC=%s keeps XLA from hanging on few cores",
+            "about 4,000 with --backend=cpu_pool; NPROC=%s keeps XLA from hanging on few cores",
             os.environ["NPROC"],
         )

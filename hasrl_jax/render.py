@@ -81,12 +81,12 @@ def play(
     env_step_s = env.task.env_step_s
     recent: deque[list[float]] = deque(maxlen=round(SPEED_AVERAGE_S / env_step_s) or 1)
     observation, _ = env.reset(seed=seed)
-    is_first, falls = True, 0
+    is_first, falls, push_frame = True, 0, round(push.at_s / env_step_s)
     for frame in range(frames):
         time_s = frame * env_step_s
         if speeds and (is_first or speeds.at(frame - 1, frames) != speeds.at(frame, frames)):
             observation = env.set_command(speeds.at(frame, frames), speeds.lateral_m_s)
-        pushed = push.force_n != 0 and push.at_s <= time_s < push.at_s + PUSH_S
+        pushed = push.force_n != 0 and 0 <= frame - push_frame < round(PUSH_S / env_step_s)
         if pushed:
             env.push(0.0, push.force_n * env_step_s)
         image = env.render()
@@ -176,11 +176,15 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
     """
     from hasrl_jax import cli
+    from hasrl_jax.config import ConfigError
     from hasrl_jax.envs import gymnasium_env
     from hasrl_jax.policies import load_policy_parameters, with_physics
 
     _check(known)
     config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    for name in ("push", "forward", "speeds", "lateral"):
+        if config.task != "cassie" and getattr(known, name):
+            raise ConfigError(f"--{name}: a policy of task {config.task} cannot be commanded or pushed; leave it out")
     config = _config_to_film(with_physics(config, known.physics), known)
     config = cli.override_for_policy(config, rest, "render")
     strip = _strip(known)

@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hasrl_jax.figures import COLOURS
+
 Rows = list[dict[str, Any]]
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 # heading, key, how to write a value
 Column = tuple[str, str, Callable[[Any], str]]

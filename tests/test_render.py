@@ -149,6 +149,28 @@ def test_bad_arguments_name_the_field(arguments: list[str], field: str) -> None:
         render.render(known, rest)
 
 
+def test_a_policy_of_another_task_is_not_pushed(tmp_path: Path) -> None:
+    config = from_dict({"task": "cartpole", "physics": {"timestep_s": 0.005, "steps_per_env_step": 5}}, CONFIG)
+    config = from_dict({"network": {"symmetric": False}}, config)
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    path = tmp_path / "cartpole.npz"
+    checkpoint.save_policy(path, ppo.export_parameters(learner), policies.policy_metadata(config))
+    known, rest = render._parse(["--policy", str(path), "--push", "9", "--out", str(tmp_path / "film.mp4")])
+    with pytest.raises(ConfigError, match="--push: a policy of task cartpole"):
+        render.render(known, rest)
+
+
+@pytest.mark.parametrize("at_s", [0.1, 0.7])
+def test_a_push_lasts_as_long_whenever_it_begins(policy: Path, at_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = TaskEnv(CONFIG)
+    monkeypatch.setattr(env, "render", lambda: np.zeros((48, 64, 3), np.uint8))
+    parameters = policies.load_policy_parameters(None, policy)[1]
+    moments = list(render.play(env, parameters, 40, 0, render.Push(1.0, at_s)))
+    assert sum(moment.pushed for moment in moments) == 8
+    assert moments[round(at_s / env.task.env_step_s)].pushed
+
+
 def test_a_policy_file_brings_its_configuration(policy: Path, tmp_path: Path) -> None:
     config, parameters = policies.load_policy_parameters(None, policy)
     assert config == CONFIG

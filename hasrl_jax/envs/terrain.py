@@ -1,7 +1,7 @@
 """The ground: flat, stairs, or blocks of random heights, drawn anew for every episode.
 
 It changes along x alone, in blocks of one length per episode, and `heights` is the one formula behind both the boxes
-that the robot treads on and the height above ground in the task. Boxes have sharp edges and cost the physics a tenth;
+that the robot treads on and the height above ground in the task. Boxes have sharp edges and cost the physics a fifth;
 a height field slants every riser by a cell, and at cells of 2.5 cm doubles the cost.
 """
 

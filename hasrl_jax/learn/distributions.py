@@ -27,10 +27,3 @@ def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Arra
 def entropy(log_std: jax.Array) -> jax.Array:
     """Differential entropy, [...]: sum_a (log std + (1 + log 2 pi) / 2). Source: H of paper II.E."""
     return jnp.sum(log_std + 0.5 * (1.0 + _LOG_TWO_PI), axis=-1)
-
-
-def kl(mean_p: jax.Array, log_std_p: jax.Array, mean_q: jax.Array, log_std_q: jax.Array) -> jax.Array:
-    """KL(p || q), [...]: sum_a (log(std_q / std_p) + (std_p^2 + (mean_p - mean_q)^2) / (2 std_q^2) - 1/2)."""
-    variance_ratio = jnp.exp(2.0 * (log_std_p - log_std_q))
-    distance = jnp.square((mean_p - mean_q) * jnp.exp(-log_std_q))
-    return jnp.sum(log_std_q - log_std_p + 0.5 * (variance_ratio + distance - 1.0), axis=-1)

@@ -7,7 +7,7 @@ import numpy as np
 from hasrl_jax.collect.numpy_policy import Parameters
 from hasrl_jax.config import Config
 from hasrl_jax.envs import clock
-from hasrl_jax.envs.rewards import TERMS
+from hasrl_jax.envs.rewards import SCORES, TERMS
 from hasrl_jax.pictures.record import record
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 SPEEDS_M_S = (0.0, 1.0, 0.5)
 SECONDS_EACH = 4.0
-SCORES = ("foot_force", "foot_velocity")  # not bounded by their weight
 LINE, FAINT, COMMAND = "#1f6f8b", "#a9c9d6", "#333333"
 
 
@@ -42,7 +41,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
         panel.plot(time_s, values, color=FAINT, linewidth=0.8)
         panel.plot(time_s, smooth(values, span), color=LINE)
         panel.axhline(weight, color=COMMAND, linewidth=0.8, linestyle=":")
-        if name not in SCORES:
+        if name not in SCORES:  # these are not bounded by their weight
             panel.set_ylim(0, 1.1 * weight)
         panel.set_title(f"{name.replace('_', ' ')}: {values.mean():.3f}", loc="left", fontsize=9)
     for panel in panels.values():
