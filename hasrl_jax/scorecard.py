@@ -33,7 +33,7 @@ CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands c
 CHANGE_S = (2.0, 6.0)  # seconds between commands
 PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 PUSH_SPEEDS_M_S = (1.0, 0.0)
-# Walk, a random moment within, duration, then survive; walking takes longest, or a second push would come before the end.
+# Walk, a random moment within, duration, then survive; the walk is the longest, or a second push would come in time.
 PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 6.0, 1.0, 0.2, 5.0
 FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
