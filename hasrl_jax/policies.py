@@ -15,7 +15,8 @@ from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import normalize, ppo
 from hasrl_jax.run_directory import CHECKPOINTS_DIRECTORY, load_run_config
 
-RELEASED = Path(__file__).parent / "released" / "cassie_walk.npz"
+_FOLDER = Path(__file__).parent / "released"
+RELEASED = {"released": _FOLDER / "cassie_walk.npz", "released-stairs": _FOLDER / "cassie_stairs.npz"}
 
 
 def load_policy_parameters(
@@ -25,8 +26,8 @@ def load_policy_parameters(
 
     Args:
       run_dir: a run directory, whose newest whole checkpoint is taken; or None.
-      policy: a file of `checkpoint.save_policy` with its configuration under `config`, or "released" for the policy
-        that comes with the package, which is also what None for both gives.
+      policy: a file of `checkpoint.save_policy` with its configuration under `config`, or one of `RELEASED`, the
+        policies that come with the package; None for both gives "released".
 
     Raises:
       ConfigError: both are given.
@@ -36,7 +37,8 @@ def load_policy_parameters(
         raise ConfigError("--run-dir and --policy: give only one of them")
     if run_dir is not None:
         return _from_run(Path(run_dir))
-    return _from_file(RELEASED if policy is None or str(policy) == "released" else Path(policy))
+    source = policy or "released"
+    return _from_file(RELEASED.get(str(source), Path(source)))
 
 
 def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray]]:
@@ -70,7 +72,7 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
     """The parameters that a run of `config` starts from, its exploration included.
 
     Args:
-      source: a policy file, "released", or a run directory.
+      source: a policy file, one of `RELEASED`, or a run directory.
 
     Raises:
       ConfigError: another task or network than the run's; RunError, CheckpointError: as `load_policy_parameters`.
@@ -106,7 +108,7 @@ def policy_metadata(config: Config) -> dict[str, object]:
 
 
 def _from_source(source: str) -> tuple[Config, dict[str, np.ndarray]]:
-    """`load_policy_parameters` of a run directory, a file, or "released"."""
+    """`load_policy_parameters` of a run directory, a file, or one of `RELEASED`."""
     return load_policy_parameters(*((source, None) if Path(source).is_dir() else (None, source)))
 
 
