@@ -38,7 +38,10 @@ def load_policy_parameters(
     if run_dir is not None:
         return _from_run(Path(run_dir))
     source = policy or "released"
-    return _from_file(RELEASED.get(str(source), Path(source)))
+    path = RELEASED.get(str(source), Path(source))
+    if not path.exists():
+        raise CheckpointError(f"{path}: there is no such file; expected a policy file, {' or '.join(RELEASED)}")
+    return _from_file(path)
 
 
 def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray]]:
