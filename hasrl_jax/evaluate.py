@@ -20,7 +20,7 @@ from hasrl_jax.envs.task import Task
 
 SETTLE_S = 3.0  # the speed error counts from this long after an episode's start or a new command
 MAX_SECONDS = 3600.0
-MIN_SCORECARD_S = 4.0  # a second more than a speed takes to settle
+MIN_SCORECARD_S = SETTLE_S + 1.0
 
 
 class Episodes(NamedTuple):
