@@ -1,35 +1,8 @@
-"""Writes the policy of a run to one file: `python -m hasrl_jax.export --run-dir DIR --out FILE.npz`."""
+"""Entry point of `python -m hasrl_jax.export`."""
 
 import sys
-from pathlib import Path
 
-from hasrl_jax import checkpoint, cli, config, policies
-from hasrl_jax.arguments import OneLineParser
-
-
-def export(arguments: list[str]) -> None:
-    """The command: the newest whole checkpoint's parameters with their configuration, hashed, without pickle."""
-    parser = OneLineParser(
-        prog="python -m hasrl_jax.export",
-        description="Write a policy to one file. Physics and cassie settings that differ from the training's, and that "
-        "whoever plays the file then starts from, can be given: --cassie.randomize.enabled False",
-        allow_abbrev=False,
-    )
-    parser.add_argument("--run-dir", type=Path, required=True, help="a run directory")
-    parser.add_argument("--out", type=Path, required=True, help="the file to write, .npz")
-    known, rest = parser.parse_known_args(arguments)
-    settings, parameters = policies.load_policy_parameters(known.run_dir, None)
-    # Where it was trained is nobody's business, and its curriculum is over.
-    settings = cli.override_for_policy(config.from_dict({"run_dir": "", "stages": []}, settings), rest, "export")
-    checkpoint.save_policy(known.out, parameters, policies.policy_metadata(settings))
-    print(f"{known.out}: {known.out.stat().st_size / 1000:.0f} kB")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """The command line; returns the exit status."""
-    cli.log_to_terminal()
-    return cli.run(lambda: export(sys.argv[1:] if argv is None else argv))
-
+from hasrl_jax.cli.export import main
 
 if __name__ == "__main__":
     sys.exit(main())

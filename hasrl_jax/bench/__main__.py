@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from typing import Protocol
 
-from hasrl_jax import cli
 from hasrl_jax.bench.report import claim_file, describe_machine
+from hasrl_jax.cli import parsing as cli
 
 # name -> (module with the functions of `Bench`, one line for --help); modules load only when they are run
 BENCHES = {

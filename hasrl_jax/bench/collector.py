@@ -14,10 +14,10 @@ import psutil
 
 from hasrl_jax.bench.physics_limit import PhysicsLimit
 from hasrl_jax.bench.report import format_table
-from hasrl_jax.collect.cpu_pool import CpuPool
 from hasrl_jax.collect.plan import MOST_ENVS, make_plan
-from hasrl_jax.config import Config, available_cores
-from hasrl_jax.config_checks import check
+from hasrl_jax.collect.supervisor import CpuPool
+from hasrl_jax.config.limits import check
+from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 

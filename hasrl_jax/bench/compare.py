@@ -22,10 +22,10 @@ import jax
 from hasrl_jax.bench.collector import PHYSICS, with_physics
 from hasrl_jax.bench.compare_peers import PeerProcess
 from hasrl_jax.bench.report import format_table
+from hasrl_jax.collect.collectors import Collector, make_collector, prepare_jax
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.collectors import Collector, make_collector, prepare_jax
-from hasrl_jax.config import DEFAULT_CONFIG, Config, ConfigError, available_cores, load_yaml
-from hasrl_jax.config_checks import check
+from hasrl_jax.config.limits import check
+from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, ConfigError, available_cores, load_yaml
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 

@@ -21,10 +21,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from hasrl_jax import config as config_module
-from hasrl_jax.collect.cpu_pool import ONE_THREAD, WorkerError
+from hasrl_jax.collect.supervisor import ONE_THREAD, WorkerError
 from hasrl_jax.collect.worker import die_with_parent, reply
-from hasrl_jax.config import Config
+from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registration import ENVIRONMENTS
 
 START_TIMEOUT_S = 180.0  # importing torch on a slow disk, then one process per environment
@@ -111,7 +111,7 @@ def make_env(config: Config, parent: int) -> gymnasium.Env:
     if os.getpid() != parent:
         die_with_parent(parent)
     name = next(name for name, task in ENVIRONMENTS.items() if task == config.task)
-    env = gymnasium.make(f"hasrl_jax.envs.gymnasium_env:{name}", config=config, disable_env_checker=True)
+    env = gymnasium.make(f"hasrl_jax.envs.gymnasium:{name}", config=config, disable_env_checker=True)
     return WithoutInfo(env)
 
 

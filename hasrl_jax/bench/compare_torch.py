@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from hasrl_jax.config import PPOConfig
+from hasrl_jax.config.schema import PPOConfig
 
 Carry = tuple[torch.Tensor, torch.Tensor]  # (h, c), each [L, B, H]
 

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from hasrl_jax.bench.report import format_table
-from hasrl_jax.config import Config, shipped
-from hasrl_jax.envs import cassie
+from hasrl_jax.config.schema import Config, shipped
+from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.networks import zero_carry
 from hasrl_jax.types import Trajectory

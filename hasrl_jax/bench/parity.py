@@ -1,14 +1,14 @@
-"""`bench parity`: how closely MJX follows C MuJoCo from the same states, actions and draws; see `hasrl_jax.parity`."""
+"""`bench parity`: how closely MJX follows C MuJoCo from the same states, actions and draws; see `engine_parity`."""
 
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from hasrl_jax import parity
+from hasrl_jax.bench import engine_parity as parity
 from hasrl_jax.bench.report import claim_file
-from hasrl_jax.collectors import prepare_jax
-from hasrl_jax.config import Config, ConfigError, load_yaml
-from hasrl_jax.config_checks import check
+from hasrl_jax.collect.collectors import prepare_jax
+from hasrl_jax.config.limits import check
+from hasrl_jax.config.schema import Config, ConfigError, load_yaml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

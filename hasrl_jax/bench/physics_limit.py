@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.config import Config
-from hasrl_jax.envs.cpu_env import PHYSICS_STATE, CpuEnvs
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cpu_engine import PHYSICS_STATE, CpuEnvs
 from hasrl_jax.envs.registry import make_task
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from hasrl_jax.config import available_cores
+from hasrl_jax.config.schema import available_cores
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from hasrl_jax import config as config_module
 from hasrl_jax.bench.report import claim_file, format_table
-from hasrl_jax.config import CONFIG_FOLDER, Config, ConfigError, load_yaml
-from hasrl_jax.config_checks import check
+from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.limits import check
+from hasrl_jax.config.schema import CONFIG_FOLDER, Config, ConfigError, load_yaml
 from hasrl_jax.learn import ppo
-from hasrl_jax.run_directory import METRICS_FILE
-from hasrl_jax.train import train
+from hasrl_jax.runs.directory import METRICS_FILE
+from hasrl_jax.train.loop import train
 
 SCHEDULES = ("sync", "overlap", "decoupled")
 Curve = list[dict[str, Any]]

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from hasrl_jax.config import CollectConfig, Config
+from hasrl_jax.config.schema import CollectConfig, Config
 
 MOST_ENVS = 128  # environments per worker that are chosen by themselves; what more would gain: docs/performance.md
 

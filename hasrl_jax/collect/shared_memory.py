@@ -12,9 +12,9 @@ import tempfile
 import numpy as np
 import psutil
 
-from hasrl_jax.collect.numpy_policy import Parameters, parameter_shapes
 from hasrl_jax.collect.plan import Plan
-from hasrl_jax.config import Config, NetworkConfig
+from hasrl_jax.config.schema import Config, NetworkConfig
+from hasrl_jax.policy.numpy_networks import Parameters, parameter_shapes
 
 Specs = dict[str, tuple[tuple[int, ...], str]]  # name -> (shape, dtype)
 ALIGNMENT = 64  # bytes, a cache line

@@ -18,13 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from hasrl_jax import config as config_module
-from hasrl_jax.collect import numpy_policy, shared_memory
+from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.plan import Plan, make_plan
-from hasrl_jax.config import Config
-from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
+from hasrl_jax.policy import numpy_networks as numpy_policy
 from hasrl_jax.types import Mirror
 
 PR_SET_PDEATHSIG = 1

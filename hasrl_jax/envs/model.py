@@ -7,9 +7,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from hasrl_jax.config import PhysicsConfig
+from hasrl_jax.config.schema import PhysicsConfig
 
-ASSETS = Path(__file__).parent / "assets"
+ASSETS = Path(__file__).parent
 MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")  # per leg, left leg first
 PASSIVE_JOINTS = ("shin", "tarsus", "foot")  # per leg, left leg first
 SIDES = ("left", "right")
@@ -18,7 +18,7 @@ SIDES = ("left", "right")
 def load_model(
     asset: str, physics: PhysicsConfig, ground: Callable[[mujoco.MjSpec], None] | None = None, visual: bool = False
 ) -> mujoco.MjModel:
-    """Compiles `assets/<asset>` with the configured time step, solver and integrator.
+    """Compiles a model file of this folder with the configured time step, solver and integrator.
 
     `ground` edits the description first, see `Task.ground`.
     Shapes that only pictures need cost physics 6 % and most of a model's memory, so they come only with `visual`.

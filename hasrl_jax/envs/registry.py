@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 
-from hasrl_jax.config import Config
-from hasrl_jax.envs import cartpole, cassie
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cartpole import task as cartpole
+from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.task import Task
 
 TASKS: dict[str, Callable[[Config], Task]] = {"cassie": cassie.make, "cartpole": cartpole.make}

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hasrl_jax.config import PPOConfig
+from hasrl_jax.config.schema import PPOConfig
 from hasrl_jax.learn import distributions, networks, returns
 from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS
 from hasrl_jax.learn.networks import Parameters, Policy, Value

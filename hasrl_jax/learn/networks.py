@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hasrl_jax.config import NetworkConfig
+from hasrl_jax.config.schema import NetworkConfig
 from hasrl_jax.learn.lstm import GATES, lstm_layer
 from hasrl_jax.types import Mirror
 

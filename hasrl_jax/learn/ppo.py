@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hasrl_jax.config import Config, ConfigError, PPOConfig
+from hasrl_jax.config.schema import Config, ConfigError, PPOConfig
 from hasrl_jax.learn import networks, normalize
 from hasrl_jax.learn.batching import minibatch_indices
 from hasrl_jax.learn.losses import (

@@ -13,9 +13,9 @@ import numpy as np
 import psutil
 import pytest
 
-from hasrl_jax.collect import cpu_pool
-from hasrl_jax.collect.cpu_pool import CpuPool, WorkerError
+from hasrl_jax.collect import supervisor as cpu_pool
 from hasrl_jax.collect.plan import make_plan
+from hasrl_jax.collect.supervisor import CpuPool, WorkerError
 from hasrl_jax.envs.registry import make_task
 
 
@@ -190,9 +190,9 @@ def test_workers_leave_terminal_signals_to_the_pool(make_pool, parameters):
 def test_workers_end_with_a_killed_parent(make_config):
     script = """
         import time
-        from hasrl_jax.collect.cpu_pool import CpuPool
+        from hasrl_jax.collect.supervisor import CpuPool
         from hasrl_jax.collect.plan import make_plan
-        from hasrl_jax.config import from_dict
+        from hasrl_jax.config.schema import from_dict
         from hasrl_jax.envs.registry import make_task
         config = from_dict({"task": "cartpole", "collect": {"num_workers": 2}})
         pool = CpuPool(config, make_plan(config), make_task(config))

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hasrl_jax import config as config_module
-from hasrl_jax.collect.cpu_pool import MAX_FAILURES, WorkerError
-from hasrl_jax.collect.free_pool import FreePool
+from hasrl_jax.collect.decoupled import FreePool
 from hasrl_jax.collect.plan import make_plan
+from hasrl_jax.collect.supervisor import MAX_FAILURES, WorkerError
+from hasrl_jax.config import schema as config_module
 from hasrl_jax.envs.registry import make_task
 
 WORKERS, SLOTS, STEPS, SEGMENTS = 2, 4, 96, 12  # of a slot: steps and trajectories

@@ -11,11 +11,11 @@ import numpy as np
 import psutil
 import pytest
 
-from hasrl_jax.collect.cpu_pool import MAX_FAILURES, CpuPool, WorkerError
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.collect.ray_cluster import import_ray
-from hasrl_jax.collect.ray_pool import RayPool
-from hasrl_jax.config import ConfigError, RayConfig
+from hasrl_jax.collect.ray.cluster import import_ray
+from hasrl_jax.collect.ray.pool import RayPool
+from hasrl_jax.collect.supervisor import MAX_FAILURES, CpuPool, WorkerError
+from hasrl_jax.config.schema import ConfigError, RayConfig
 from hasrl_jax.envs.registry import make_task
 
 # Read when Ray is loaded.

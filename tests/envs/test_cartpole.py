@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hasrl_jax.config import Config
-from hasrl_jax.envs import cartpole
-from hasrl_jax.envs.cpu_env import CpuEnvs
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cartpole import task as cartpole
+from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.task import Reading
 
 TASK = cartpole.make(Config(task="cartpole"))

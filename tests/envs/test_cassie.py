@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config import Config, from_dict
-from hasrl_jax.envs import cassie, commands
-from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState
+from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.envs.cassie import commands
+from hasrl_jax.envs.cassie import task as cassie
+from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.task import Reading, Task
 
 MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")

@@ -1,4 +1,4 @@
-"""Holds `envs/assets/cassie.xml` to the published parameters of Cassie, and to how a legged robot must behave."""
+"""Holds `envs/cassie/cassie.xml` to the published parameters of Cassie, and to how a legged robot must behave."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ def by_name(record: dict[str, Any]) -> str:
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
     """The compiled model exactly as the file states it, before any physics option is applied."""
-    return mujoco.MjModel.from_xml_path(str(ASSETS / "cassie.xml"))
+    return mujoco.MjModel.from_xml_path(str(ASSETS / "cassie" / "cassie.xml"))
 
 
 def at_stand(model: mujoco.MjModel) -> mujoco.MjData:

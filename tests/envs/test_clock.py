@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from hasrl_jax.cassie_config import ClockConfig
-from hasrl_jax.envs import clock
+from hasrl_jax.envs.cassie import clock
+from hasrl_jax.envs.cassie.settings import ClockConfig
 
 CONFIG = ClockConfig()
 SPEEDS = (-0.3, 0.0, 1.0, 2.5, 4.0)

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config import Config, from_dict
-from hasrl_jax.envs.cpu_env import CpuEnvs, EnvState, StepResult
+from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.registry import make_task
 
 TASK = make_task(Config())

@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax import config as config_module
-from hasrl_jax import parity
-from hasrl_jax.config import Config, ConfigError
-from hasrl_jax.envs.mjx_env import MjxEngine, MjxEnvState, make_engine
+from hasrl_jax.bench import engine_parity as parity
+from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState, make_engine
 from hasrl_jax.envs.mjx_physics import find_loops
 from hasrl_jax.envs.registry import make_task
 

@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from hasrl_jax.cassie_config import RewardConfig
-from hasrl_jax.config import Config
-from hasrl_jax.envs import cassie, clock, rewards
-from hasrl_jax.envs.cpu_env import CpuEnvs
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cassie import clock, rewards
+from hasrl_jax.envs.cassie import task as cassie
+from hasrl_jax.envs.cassie.settings import RewardConfig
+from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.task import Reading, Task
 
 PAPER = RewardConfig(lateral_velocity_share=0.0, follow_lateral_command=False)

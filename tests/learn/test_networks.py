@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hasrl_jax.config import NetworkConfig
+from hasrl_jax.config.schema import NetworkConfig
 from hasrl_jax.learn import lstm
 from hasrl_jax.learn.networks import Mirror, Policy, make_networks, zero_carry
 

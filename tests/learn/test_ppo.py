@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hasrl_jax.config import Config, NetworkConfig, PPOConfig
+from hasrl_jax.config.schema import Config, NetworkConfig, PPOConfig
 from hasrl_jax.learn import distributions, losses, normalize, ppo
 from hasrl_jax.learn.networks import make_networks, zero_carry
 from hasrl_jax.types import Trajectory

@@ -1,0 +1,44 @@
+"""Command-line arguments of the programs: complaints on one line, and outputs checked before the work."""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import NoReturn
+
+from hasrl_jax.config.schema import ConfigError
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """An argument parser whose complaint is one line on stderr, without the usage; exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"error: {message.removeprefix('argument ')}\n")
+
+
+def add_policy_options(parser: argparse.ArgumentParser) -> None:
+    """The options of every program that plays a policy, see `policies.load_policy_parameters`."""
+    parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
+    parser.add_argument("--policy", help='a policy file (.npz), "released" (the default) or "released-stairs"')
+    parser.add_argument("--physics", choices=("paper", "training"), default="paper", help="2 kHz, or as trained")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def require_writable(option: str, path: Path, suffix: str = "") -> None:
+    """Proves that the file can be written, and leaves it as it is.
+
+    Raises:
+      ConfigError: the name has not the `suffix`, there is no such folder, or nothing can be written there.
+    """
+    if suffix and path.suffix.lower() != suffix:
+        raise ConfigError(f"{option}: got {path}; expected a name that ends in {suffix}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option}: got {path}; expected a file in a folder that exists, and {path.parent} does not")
+    try:
+        if path.exists():
+            with open(path, "ab"):
+                pass
+        else:
+            with tempfile.TemporaryFile(dir=path.parent):
+                pass
+    except OSError as error:
+        raise ConfigError(f"{option}: {path} cannot be written ({error.strerror})") from None

@@ -1,0 +1,287 @@
+"""The pool of worker processes: starts them, hands out parameters, gathers trajectories, replaces the dead.
+
+Messages are short JSON texts over one connection per worker; parameters and trajectories never pass
+through it but lie in shared memory, double-buffered by the parity of the iteration.
+Source: paper section III.A and Figure 1.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from multiprocessing.connection import Connection, Pipe, wait
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from hasrl_jax.collect import shared_memory
+from hasrl_jax.collect.buffer import Collected, merge
+from hasrl_jax.collect.plan import Plan
+from hasrl_jax.config.schema import Config, to_dict
+from hasrl_jax.envs.task import Task
+from hasrl_jax.policy import numpy_networks as numpy_policy
+
+log = logging.getLogger("hasrl_jax")
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")}
+MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in between
+
+
+class WorkerError(RuntimeError):
+    """Workers cannot be started or keep failing; the message carries the cause."""
+
+
+class _Worker(NamedTuple):
+    process: subprocess.Popen
+    connection: Connection
+
+
+class CpuPool:
+    """Worker processes that collect in parallel; use as a context manager.
+
+    Args:
+      config: the run's configuration, sent to every worker.
+      plan: sizes from `make_plan(config)`.
+      task: for the sizes of observations and actions.
+
+    Raises:
+      OSError: too little memory for the shared block.
+      WorkerError: the workers do not start; carries the first traceback or exit signal.
+    """
+
+    def __init__(self, config: Config, plan: Plan, task: Task):
+        self.config, self.plan = config, plan
+        self.workers_lost = 0
+        self._failures = [0] * plan.num_workers
+        self._workers: list[_Worker] = []
+        self._block = shared_memory.open_block(config, plan, task.observation_size, task.action_size)
+        self._iteration, self._version = -1, -1
+        self.busy = False  # between `start` and `finish`
+        self._started = 0.0
+        try:
+            for index in range(plan.num_workers):
+                self._workers.append(self._spawn(index))
+            for index in range(plan.num_workers):
+                self._await_ready(index)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "CpuPool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def process_ids(self) -> list[int]:
+        """Operating-system process of each worker, in worker order."""
+        return [worker.process.pid for worker in self._workers]
+
+    def start(self, parameters: dict[str, np.ndarray], iteration: int, version: int) -> None:
+        """Asks every worker for one iteration of steps; returns at once.
+
+        Args:
+          parameters: copied to the workers.
+          iteration: selects the random streams and, by its parity, the buffers.
+          version: of the parameters.
+        """
+        buffer = iteration % shared_memory.NUM_BUFFERS
+        self.write_parameters(buffer, parameters)
+        self._iteration, self._version, self._started = iteration, version, time.monotonic()
+        self.busy = True
+        for index in range(self.plan.num_workers):
+            self.order(index, iteration, buffer)
+
+    def finish(self) -> Collected:
+        """Waits for the iteration that `start` asked for and merges the workers' buffers.
+
+        A worker that dies or falls silent is replaced; only its own part of this iteration is lost.
+
+        Raises:
+          WorkerError: no worker finished, or one failed too many times in a row.
+        """
+        pending = set(range(self.plan.num_workers))
+        statistics: dict[int, dict[str, Any]] = {}
+        cause: str | None = None
+        while pending:
+            for index, answer in self.answers(pending, timeout_s=1.0).items():
+                pending.discard(index)
+                if isinstance(answer, str):
+                    cause = answer
+                else:
+                    statistics[index] = answer
+        self.busy = False
+        if not statistics:
+            raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
+        finished = sorted(statistics)
+        slots = [self.slot(index, self._iteration) for index in finished]
+        ordered = [statistics[index] for index in finished]
+        return merge(slots, ordered, self._version, time.monotonic() - self._started)
+
+    def write_parameters(self, copy: int, parameters: dict[str, np.ndarray]) -> None:
+        """Fills one of the copies of the parameters in shared memory, which no worker may be using."""
+        for name, array in self._block.parameters[copy].items():
+            array[:] = parameters[name]
+
+    def order(self, index: int, iteration: int, copy: int) -> None:
+        """Asks one worker to fill its slot of an iteration with a copy of the parameters; returns at once."""
+        self._block.heartbeat[index] = time.monotonic()
+        slot = iteration % shared_memory.NUM_BUFFERS
+        self._send(index, {"do": "collect", "iteration": iteration, "parameters": copy, "slot": slot})
+
+    def slot(self, index: int, iteration: int) -> dict[str, np.ndarray]:
+        """Where a worker writes in an iteration; it does so again two iterations later."""
+        return self._block.slots[iteration % shared_memory.NUM_BUFFERS][index]
+
+    def answers(self, indices: Iterable[int], timeout_s: float) -> dict[int, dict[str, Any] | str]:
+        """Waits for any of the workers that were given an order.
+
+        Returns:
+          By worker: the statistics of one that has finished; how it was lost of one that was, and was replaced.
+
+        Raises:
+          WorkerError: one failed too many times in a row.
+        """
+        answers: dict[int, dict[str, Any] | str] = {}
+        by_connection = {self._workers[index].connection: index for index in indices}
+        for ready in wait(list(by_connection), timeout_s):
+            index = by_connection[cast(Connection, ready)]
+            reply, failure = self._receive(index)
+            if failure is None:
+                answers[index] = json.loads(reply)
+                self._failures[index] = 0
+            else:
+                answers[index] = failure
+                self._replace(index, failure)
+        for index in self._replace_silent(set(by_connection.values()) - answers.keys()):
+            answers[index] = self._silence()
+        return answers
+
+    def save(self) -> list[bytes]:
+        """The state of every worker's environments; only between `finish` and `start`.
+
+        A worker that is lost meanwhile is replaced and has an empty state, so its episodes begin anew.
+        """
+        states = []
+        for index in range(self.plan.num_workers):
+            self._send(index, {"do": "save"})
+            state, failure = self._answer(index)
+            states.append(state)
+            if failure is not None:
+                self._replace(index, failure)
+        return states
+
+    def load(self, states: list[bytes]) -> None:
+        """Restores what `save` returned; environments that differ in number begin new episodes instead."""
+        if len(states) != self.plan.num_workers:
+            if states:
+                log.warning("%d workers saved, %d run: all episodes begin anew", len(states), self.plan.num_workers)
+            return
+        for index, state in enumerate(states):
+            self._send(index, {"do": "load"})
+            self._send(index, state)
+            reply, failure = self._answer(index)
+            if failure is not None:
+                self._replace(index, failure)
+            elif state and not json.loads(reply)["loaded"]:
+                log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+
+    def close(self) -> None:
+        """Ends all workers and frees the shared memory."""
+        for worker in self._workers:
+            worker.connection.close()
+            worker.process.kill()  # it holds nothing that needs tidying
+            worker.process.wait()
+        self._workers = []
+        self._block.close()
+
+    def _spawn(self, index: int) -> _Worker:
+        """A new interpreter that inherits the connection and the shared block, and one thread."""
+        ours, theirs = Pipe()
+        descriptors = (theirs.fileno(), self._block.descriptor)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hasrl_jax.collect.worker", *map(str, descriptors)],
+            pass_fds=descriptors,
+            stdin=subprocess.DEVNULL,
+            env=numpy_policy.blas_variables() | os.environ | ONE_THREAD,
+        )
+        theirs.close()
+        setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}
+        with contextlib.suppress(OSError):  # it died at once; waiting for it to be ready says how
+            ours.send_bytes(json.dumps(setup).encode())
+        return _Worker(process, ours)
+
+    def _await_ready(self, index: int) -> None:
+        timeout = self.config.collect.worker_start_timeout_s
+        worker = self._workers[index]
+        if not worker.connection.poll(timeout):
+            raise WorkerError(f"worker {index} did not start within collect.worker_start_timeout_s={timeout:g} s")
+        _, failure = self._receive(index)
+        if failure is not None:
+            raise WorkerError(f"worker {index} did not start: it {failure}")
+
+    def _send(self, index: int, message: dict[str, Any] | bytes) -> None:
+        data = message if isinstance(message, bytes) else json.dumps(message).encode()
+        with contextlib.suppress(OSError):  # it died; its closed connection says so when the reply is awaited
+            self._workers[index].connection.send_bytes(data)
+
+    def _answer(self, index: int) -> tuple[bytes, str | None]:
+        """As `_receive`, for a request that is answered at once: a worker that stays silent has failed."""
+        if not self._workers[index].connection.poll(self.config.collect.worker_timeout_s):
+            return b"", self._silence()
+        return self._receive(index)
+
+    def _receive(self, index: int) -> tuple[bytes, str | None]:
+        """The worker's message, empty if it failed, and how it failed if it did."""
+        worker = self._workers[index]
+        try:
+            data = worker.connection.recv_bytes()
+        except (EOFError, OSError):
+            code = worker.process.wait()
+            return b"", f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
+        if data.startswith(b'{"error"'):
+            error = json.loads(data)["error"].rstrip()
+            log.warning("worker %d (process %d) failed:\n%s", index, worker.process.pid, error)
+            return b"", f"raised {error.splitlines()[-1]}"
+        return data, None
+
+    def _silence(self) -> str:
+        return f"was silent for collect.worker_timeout_s={self.config.collect.worker_timeout_s:g} s"
+
+    def _replace_silent(self, pending: set[int]) -> set[int]:
+        """Replaces workers without a heartbeat; returns their indices."""
+        limit = self.config.collect.worker_timeout_s
+        silent = {
+            index
+            for index in pending
+            # An answer that waits to be read says that it is alive, however long this process was held up.
+            if time.monotonic() - self._block.heartbeat[index] > limit and not self._workers[index].connection.poll(0)
+        }
+        for index in silent:
+            self._replace(index, self._silence())
+        return silent
+
+    def _replace(self, index: int, cause: str) -> None:
+        """Starts another worker in place of a lost one, more than once if the new one does not start either."""
+        while True:
+            old = self._workers[index]
+            lost = "its part of this iteration is lost, starting another"
+            log.warning("worker %d (process %d) %s; %s", index, old.process.pid, cause, lost)
+            old.connection.close()
+            old.process.kill()
+            old.process.wait()
+            self.workers_lost += 1
+            self._failures[index] += 1
+            if self._failures[index] >= MAX_FAILURES:
+                raise WorkerError(f"worker {index} failed {MAX_FAILURES} times in a row; the last one {cause}")
+            self._workers[index] = self._spawn(index)
+            try:
+                self._await_ready(index)
+                return
+            except WorkerError as error:
+                cause = f"was replaced in vain: {error}"

@@ -1,0 +1,1 @@
+"""Configuration: its fields, their limits, YAML files and stages."""

@@ -1,0 +1,1 @@
+"""A small task with a known answer."""

@@ -1,0 +1,1 @@
+"""The walking task of the bipedal robot Cassie."""

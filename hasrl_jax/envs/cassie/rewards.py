@@ -1,0 +1,83 @@
+"""The eight reward terms of the paper, each a pure function of arrays with leading batch axes.
+
+r = s (w1 S_F + w2 S_V + w3 e^-(E_pel+E_foot) + w4 e^-P_m + w5 e^-E_v + w6 e^-H_p + w7 e^-T_p + w8 e^-A_p)
+
+Source: paper section II.C and Table I; the definitions behind the symbols are those of the
+published implementation.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hasrl_jax.envs.cassie.settings import RewardConfig
+from hasrl_jax.types import Array
+
+SCORES = ("foot_force", "foot_velocity")
+TERMS = (
+    *SCORES,
+    "orientation",
+    "pelvis_motion",
+    "velocity",
+    "hip_roll",
+    "torque_change",
+    "action_change",
+)
+MAX_FOOT_FORCE_N = 350.0
+MAX_FOOT_SPEED_M_S = 2.0
+CLOCK_GAIN = 1.2
+# World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
+NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
+
+
+def clock_score(clock: Array, magnitude: Array, limit: float, xp: Any) -> Array:
+    """S_F and S_V: sum over the feet of tan(pi/4 * 1.2 * clock * min(|x|, limit) / limit).
+
+    Args:
+      clock: force or velocity clock of each foot in [-1, 1], [..., 2].
+      magnitude: ground force (N) or foot speed (m/s), non-negative, [..., 2].
+    """
+    share = xp.minimum(magnitude, limit) / limit
+    return xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share).sum(axis=-1)
+
+
+def quaternion_error(quat: Array, reference: Array) -> Array:
+    """1 - <reference, quat>^2, the squared sine of half the angle between them: [..., 4] -> [...]."""
+    return 1.0 - (quat * reference).sum(axis=-1) ** 2
+
+
+def pelvis_motion(
+    lateral_m: Array,
+    height_m: Array,
+    speed: Array,
+    angular_velocity: Array,
+    acceleration: Array,
+    config: RewardConfig,
+    xp: Any,
+) -> Array:
+    """P_m: lateral drift, height error beyond a band that widens with speed, rotation and acceleration.
+
+    Args:
+      lateral_m: sideways drift of the pelvis, m, [...].
+      height_m: pelvis height, m, [...].
+      speed: commanded forward speed, m/s, [...].
+      angular_velocity: of the pelvis, rad/s, [..., 3].
+      acceleration: of the pelvis, gravity removed, m/s^2, [..., 3].
+    """
+    drift = xp.abs(lateral_m)
+    drift = xp.where(drift < 0.05, 0.0, drift)
+    height_error = xp.abs(height_m - config.height_m)
+    height_error = xp.where(height_error < 0.05 + 0.05 * xp.abs(speed), 0.0, height_error)
+    shaking = xp.abs(angular_velocity).sum(axis=-1) + xp.abs(acceleration).sum(axis=-1)
+    return drift + height_error + config.shaking * shaking
+
+
+def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> Array:
+    """The weighted, scaled terms in the order of `TERMS`, [..., 8]; their sum is the reward.
+
+    `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
+    non-negative error E whose exp(-E) is rewarded.
+    """
+    values = xp.stack([errors[name] for name in TERMS], axis=-1)
+    values = xp.concatenate([values[..., : len(SCORES)], xp.exp(-values[..., len(SCORES) :])], axis=-1)
+    return values * np.array([config.scale * getattr(config, name) for name in TERMS])

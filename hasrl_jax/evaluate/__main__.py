@@ -1,0 +1,8 @@
+"""Entry point of `python -m hasrl_jax.evaluate`."""
+
+import sys
+
+from hasrl_jax.evaluate.rollout import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+"""What a policy can do, in one table: `python -m hasrl_jax.evaluate --policy released --scorecard DIR`.
+
+C MuJoCo at 2 kHz, mean action, seeds that no training uses. Every row is a number of episodes of one kind; a fall is a
+pelvis below 0.6 m or a tilt above 45 degrees, whatever the policy was trained with. Rows are shared among processes.
+"""
+
+import hashlib
+import json
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hasrl_jax.collect.supervisor import ONE_THREAD
+from hasrl_jax.config.schema import Config, ConfigError, available_cores, from_dict, to_dict
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.evaluate import gait
+from hasrl_jax.evaluate.page import percent, write_page
+from hasrl_jax.evaluate.rollout import columns, mean_interval, run_episodes, settled_speeds, share_interval
+from hasrl_jax.policy.numpy_networks import Parameters
+
+log = logging.getLogger("hasrl_jax")
+SPEEDS_M_S = (-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+LATERAL_M_S = (-0.1, 0.1)
+LATERAL_AT_M_S = 0.5  # forward speed of the rows with a lateral command
+CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands change
+CHANGE_S = (2.0, 6.0)  # seconds between commands
+PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
+PUSH_SPEEDS_M_S = (1.0, 0.0)
+# Walk, a random moment within, duration, then survive; the walk is the longest, or a second push would come in time.
+PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 6.0, 1.0, 0.2, 5.0
+FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
+SHORT_S = 20.0  # besides the cap, survival is also told for this long
+# What every row sets itself, of `cassie`.
+SETTINGS = ("command", "push", "terrain", "termination", "randomize.enabled", "randomize.share")
+REVISION = 2  # of what a row plays and what its figures mean; those of an earlier one are measured anew
+BATCH = 25  # episodes that one job plays side by side
+
+
+class Row(NamedTuple):
+    """One kind of episode."""
+
+    kind: str  # "speed", "lateral", "changing" or "push"
+    forward_m_s: tuple[float, float]
+    lateral_m_s: tuple[float, float] = (0.0, 0.0)
+    randomized: bool = False
+    push_n: float = 0.0
+
+    @property
+    def title(self) -> str:
+        low, high = self.forward_m_s
+        speed = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s, changing"
+        if self.kind == "lateral":
+            speed += f", {self.lateral_m_s[0]:+g} m/s to the left"
+        return f"{speed}, {self.push_n:g} N push" if self.push_n else speed
+
+
+def rows() -> list[Row]:
+    """All rows of a scorecard, in the order in which they are measured."""
+    lateral = (LATERAL_AT_M_S, LATERAL_AT_M_S)
+    return [
+        *(Row("speed", (v, v)) for v in SPEEDS_M_S),
+        *(Row("changing", limits, (-0.1, 0.1), drawn) for limits in CHANGING_M_S for drawn in (False, True)),
+        *(Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N),
+        *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
+        *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
+    ]
+
+
+def row_config(trained: Config, row: Row, seconds: float) -> Config:
+    """`trained` with the commands, disturbances and ends of a row; its clock and networks stay as trained.
+
+    Episodes last `seconds`, those with a lateral command 20 s at most, and pushed ones until 5 s after the push.
+    """
+    if row.kind == "push":
+        seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
+    elif row.kind == "lateral":
+        seconds = min(seconds, SHORT_S)
+    cassie = {
+        "command": {
+            "forward_m_s": list(row.forward_m_s),
+            "lateral_m_s": list(row.lateral_m_s),
+            "stand_probability": 0.0,
+            "start_moving": 0.0,
+            "resample_s": list(CHANGE_S) if row.kind == "changing" else [0.0, 0.0],
+        },
+        "randomize": {"enabled": row.randomized, "share": 1.0},
+        "push": {
+            "force_n": [row.push_n, row.push_n],
+            "interval_s": [PUSH_AFTER_S, PUSH_AFTER_S + PUSH_PHASE_S],
+            "duration_s": PUSH_S,
+        },
+        "terrain": {"kind": "flat"},
+        "termination": FALL,
+    }
+    return from_dict(
+        {"cassie": cassie, "collect": {"max_episode_steps": round(seconds / trained.physics.env_step_s)}}, trained
+    )
+
+
+def write(
+    directory: Path,
+    policies: dict[str, tuple[Config, Parameters]],
+    episodes: int,
+    seconds: float,
+    seed: int,
+    command: str,
+) -> None:
+    """Measures every policy, the first being the one that the card is about; writes scorecard.json, .md and .png.
+
+    Rows that scorecard.json already holds of the same policies and settings are not measured again. The card's own
+    policy comes last, it stays up longest; the files are brought up to date after each of its rows.
+
+    Args:
+      directory: made if missing.
+      policies: by name: configuration, with the physics to play under, and parameters; all of the walking task.
+      episodes, seconds, seed: as in `measure`.
+      command: what to type for the same numbers, for the page.
+
+    Raises:
+      ConfigError: a policy of another task; OSError: the directory cannot be written.
+    """
+    for name, (config, _) in policies.items():
+        if config.task != "cassie":
+            raise ConfigError(f"--scorecard: {name} is of task {config.task}; only policies that walk have one")
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / "scorecard.json"
+    report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
+    report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
+    report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
+    earlier = _read(path)
+    same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
+    for name, (config, parameters) in policies.items():
+        digest = report["digests"][name] = _digest(config, parameters, seconds)
+        known = same and earlier.get("digests", {}).get(name) == digest
+        report["policies"][name] = earlier["policies"].get(name, []) if known else []
+    own = next(iter(policies))
+    for name, (config, parameters) in reversed(policies.items()):
+        measured, started = report["policies"][name], time.monotonic()
+        for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
+            measured.append(row)
+            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            if name == own:
+                write_page(report, directory)
+            robot = "randomised" if row["randomized"] else "nominal"
+            share, spent = percent(row["share_up"]), time.monotonic() - started
+            log.info("%s, %s, %s: %s up, %.0f s so far", name, row["title"], robot, share, spent)
+    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write_page(report, directory)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """An earlier report; empty when there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
+
+
+def refuse_settings(arguments: list[str]) -> None:
+    """Refuses overrides of what the rows set themselves.
+
+    Raises:
+      ConfigError: there is one.
+    """
+    for argument in arguments:
+        option = argument.partition("=")[0].replace("_", "-")
+        if option.startswith(tuple(f"--cassie.{setting}" for setting in SETTINGS)):
+            raise ConfigError(f"{option}: a scorecard sets it for each of its rows; leave it out")
+
+
+def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
+    """Tells policies apart, and what they are played under."""
+    played = [to_dict(row_config(config, row, seconds)) for row in rows()]
+    digest = hashlib.sha256(json.dumps([REVISION, played], sort_keys=True).encode())
+    for name in sorted(parameters):
+        digest.update(name.encode() + parameters[name].tobytes())
+    return digest.hexdigest()
+
+
+def measure(
+    trained: Config, parameters: Parameters, episodes: int, seconds: float, seed: int, skip: int = 0
+) -> Iterator[dict[str, Any]]:
+    """Plays the rows and yields each one's results, ready for JSON, in the order of `rows`.
+
+    Args:
+      trained: the policy's configuration, with the physics to play under.
+      parameters: as `learn.ppo.export_parameters` returns them.
+      episodes: per row.
+      seconds: time limit of the longest episodes, see `row_config`.
+      seed: the same seed gives the same numbers, whatever the number of cores.
+      skip: rows to leave out at the beginning.
+    """
+    jobs = [
+        (row, row_config(trained, row, seconds), parameters, min(BATCH, episodes - done), [seed, number, done])
+        for number, row in enumerate(rows())
+        if number >= skip
+        for done in range(0, episodes, BATCH)
+    ]
+    os.environ.update(ONE_THREAD)  # the processes inherit it before they load NumPy
+    # Fresh interpreters: forking a process that has started JAX can hang.
+    with ProcessPoolExecutor(available_cores(), multiprocessing.get_context("spawn")) as pool:
+        parts: list[dict[str, np.ndarray]] = []
+        for job, part in zip(jobs, pool.map(_play, jobs), strict=True):
+            parts.append(part)
+            if sum(len(p["seconds"]) for p in parts) == episodes:
+                yield summarize_row(job[0], job[1], parts)
+                parts = []
+
+
+def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.ndarray]:
+    """Per-episode figures of a part of a row, each [N]."""
+    _, config, parameters, episodes, seed = job
+    task = make_task(config)
+    played = run_episodes(config, task, parameters, episodes, seed)
+    column = columns(played, task)
+    mass = float(task.model.body_mass.sum())
+    figures = gait.describe(
+        column["left_force"],
+        column["right_force"],
+        column["motor_power"],
+        column["forward_speed"],
+        mass,
+        task.env_step_s,
+    )
+    last = np.maximum(played.episode_length - 1, 0)
+    heading = np.unwrap(np.nan_to_num(column["heading"]), axis=0)[last, np.arange(episodes)]
+    speeds = settled_speeds(column, task.env_step_s)
+    return {
+        "seconds": played.episode_length * task.env_step_s,
+        "reached_cap": played.reached_cap,
+        "diverged": played.diverged,
+        **{name: speeds[name] for name in ("forward_speed", "forward_speed_error", "lateral_speed_error")},
+        "heading_drift_deg": np.abs(np.rad2deg(heading)),
+        **figures,
+    }
+
+
+def summarize_row(row: Row, config: Config, parts: list[dict[str, np.ndarray]]) -> dict[str, Any]:
+    """One row's figures with 95 % intervals."""
+    values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    cap_s = config.collect.max_episode_steps * config.physics.env_step_s
+    result: dict[str, Any] = row._asdict() | {"title": row.title, "cap_seconds": cap_s}
+    result |= {"episodes": len(values["seconds"]), "diverged": int(values.pop("diverged").sum())}
+    reached = values.pop("reached_cap")
+    if row.kind == "push":  # of those that were up until the first moment of a push
+        reached = reached[values["seconds"] > PUSH_AFTER_S]
+        result["pushed_episodes"] = len(reached)
+    result["share_up"] = share_interval(reached)
+    if row.kind != "push":
+        result["share_up_20_s"] = share_interval(values["seconds"] >= min(SHORT_S, cap_s) - 1e-9)
+    # An episode that fell before the command had settled has no speed error, and one that stands no gait.
+    return result | {name: mean_interval(x) for name, x in values.items()}

@@ -1,0 +1,1 @@
+"""Policies that act: networks in NumPy, files, loading."""

@@ -1,0 +1,140 @@
+"""Loads the parameters that a policy acts with, from a run directory or from a released policy file."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hasrl_jax.config import limits as config_checks
+from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.learn import normalize, ppo
+from hasrl_jax.policy.numpy_networks import parameter_shapes
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.runs.checkpoint import CheckpointError
+from hasrl_jax.runs.directory import CHECKPOINTS_DIRECTORY, load_run_config
+
+_FOLDER = Path(__file__).parent / "released"
+RELEASED = {"released": _FOLDER / "cassie_walk.npz", "released-stairs": _FOLDER / "cassie_stairs.npz"}
+
+
+def load_policy_parameters(
+    run_dir: str | Path | None, policy: str | Path | None
+) -> tuple[Config, dict[str, np.ndarray]]:
+    """The configuration a policy was trained with, and its parameters as `ppo.export_parameters` names them.
+
+    Args:
+      run_dir: a run directory, whose newest whole checkpoint is taken; or None.
+      policy: a file of `checkpoint.save_policy` with its configuration under `config`, or one of `RELEASED`, the
+        policies that come with the package; None for both gives "released".
+
+    Raises:
+      ConfigError: both are given.
+      RunError, CheckpointError: what is named is missing, damaged or of another network.
+    """
+    if run_dir is not None and policy is not None:
+        raise ConfigError("--run-dir and --policy: give only one of them")
+    if run_dir is not None:
+        return _from_run(Path(run_dir))
+    source = policy or "released"
+    path = RELEASED.get(str(source), Path(source))
+    if not path.exists():
+        raise CheckpointError(f"{path}: there is no such file; expected a policy file, {' or '.join(RELEASED)}")
+    return _from_file(path)
+
+
+def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray]]:
+    """A policy to compare with: "zero" (the neutral pose for ever), "random" (untrained), a run directory or a file.
+
+    Args:
+      name: which.
+      like: the configuration whose task and network "zero" and "random" take.
+
+    Raises:
+      RunError, CheckpointError: as `load_policy_parameters`.
+    """
+    if name not in ("zero", "random"):
+        return _from_source(name)
+    task = make_task(like)
+    learner = ppo.init_learner(like, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    parameters = ppo.export_parameters(learner, like.network.normalize_observations)
+    factor = 0.0 if name == "zero" else 1.0  # without weights and biases the mean action is zero
+    keep = ("policy/log_std", "normalizer/mean", "normalizer/std")
+    return like, {key: array if key in keep else factor * array for key, array in parameters.items()}
+
+
+def with_physics(config: Config, physics: str) -> Config:
+    """`config` with the walking task at the "paper" 2 kHz physics; for "training", or another task, as it is."""
+    if physics == "training" or config.task != "cassie":
+        return config
+    return config_module.from_dict({"physics": config_module.to_dict(config_module.shipped("paper").physics)}, config)
+
+
+def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
+    """The parameters that a run of `config` starts from, its exploration included.
+
+    Args:
+      source: a policy file, one of `RELEASED`, or a run directory.
+
+    Raises:
+      ConfigError: another task or network than the run's; RunError, CheckpointError: as `load_policy_parameters`.
+    """
+    trained, parameters = _from_source(source)
+    if trained.task != config.task:
+        raise ConfigError(f"--init-policy {source}: a policy for task {trained.task}; this run's is {config.task}")
+    for name in ("hidden_size", "symmetric", "normalize_observations"):
+        its, ours = getattr(trained.network, name), getattr(config.network, name)
+        if its != ours:
+            raise ConfigError(f"network.{name}: got {ours}; --init-policy {source} needs --network.{name} {its}")
+    return parameters
+
+
+def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]) -> ppo.LearnerState:
+    """`learner` before its first iteration, with what `ppo.export_parameters` returned in place of its own parameters.
+
+    The optimisers stay fresh.
+    """
+
+    def group(name: str) -> dict[str, jax.Array]:
+        return {key.removeprefix(name): jnp.array(x) for key, x in parameters.items() if key.startswith(name)}
+
+    statistics, normalizer = group("normalizer/"), learner.normalizer
+    if statistics:
+        normalizer = normalize.from_mean_std(statistics["mean"], statistics["std"])
+    return learner._replace(policy_params=group("policy/"), value_params=group("value/"), normalizer=normalizer)
+
+
+def policy_metadata(config: Config) -> dict[str, object]:
+    """What a released policy file must carry besides its parameters."""
+    return {"config": config_module.to_dict(config)}
+
+
+def _from_source(source: str) -> tuple[Config, dict[str, np.ndarray]]:
+    """`load_policy_parameters` of a run directory, a file, or one of `RELEASED`."""
+    return load_policy_parameters(*((source, None) if Path(source).is_dir() else (None, source)))
+
+
+def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
+    config = load_run_config(run_dir)
+    task = make_task(config)
+    template = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    loaded = checkpoint.load(run_dir / CHECKPOINTS_DIRECTORY, template)
+    return config, ppo.export_parameters(loaded.learner, config.network.normalize_observations)
+
+
+def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
+    parameters, metadata = checkpoint.load_policy(path)
+    try:
+        config = config_module.from_dict(metadata["config"])
+        config_checks.check(config)
+    except (KeyError, TypeError, ConfigError) as error:
+        raise CheckpointError(f"{path}: its configuration cannot be read: {error}") from None
+    task = make_task(config)
+    wanted = parameter_shapes(task.observation_size, task.action_size, config.network)
+    for name, shape in wanted.items():
+        found = parameters[name].shape if name in parameters else "missing"
+        if found != shape:
+            raise CheckpointError(f"{path}: parameter {name} is {found}; its configuration asks for {shape}")
+    return config, {name: parameters[name] for name in wanted}

@@ -1,0 +1,8 @@
+"""Entry point of `python -m hasrl_jax.train`."""
+
+import sys
+
+from hasrl_jax.train.loop import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,282 @@
+"""The main job: collect, update, log, evaluate, save. `python -m hasrl_jax.train --backend=cpu_pool`."""
+
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+import jax
+
+from hasrl_jax.cli import parsing as cli
+from hasrl_jax.collect.collectors import Collector, Experience, make_collector, prepare_jax
+from hasrl_jax.collect.supervisor import WorkerError
+from hasrl_jax.config import curriculum
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import Task
+from hasrl_jax.evaluate.rollout import run_episodes
+from hasrl_jax.learn import ppo
+from hasrl_jax.policy import loading as policies
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.runs.directory import RunDirectory, open_run, write_config
+from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, Record, Silent
+from hasrl_jax.train import distributed
+from hasrl_jax.types import Mirror
+
+log = logging.getLogger("hasrl_jax")
+TEST_SEED = 1_000_003  # apart from every training stream
+
+
+class Progress(NamedTuple):
+    """Where a run stands; saved with every checkpoint."""
+
+    iteration: int = 0  # iterations finished, which is also the version of the parameters
+    env_steps: int = 0  # environment steps collected
+    seconds: float = 0.0  # spent training
+
+
+class RunState(NamedTuple):
+    """All that a checkpoint holds."""
+
+    learner: ppo.LearnerState
+    progress: Progress = Progress()
+    env_states: Sequence[bytes] = ()  # empty: episodes begin anew
+
+
+class Part(NamedTuple):
+    """A stage of the run with all that works on it."""
+
+    config: Config
+    until_env_steps: int
+    task: Task
+    update: ppo.Update
+    collector: Collector
+
+
+def train(
+    config: Config,
+    resume: bool = False,
+    init_policy: str | None = None,
+    make_update: Callable[..., ppo.Update] = ppo.make_update,
+) -> None:
+    """Runs or continues training until `total_env_steps`, Ctrl-C or SIGTERM, through the stages of its curriculum.
+
+    Args:
+      config: the run's configuration.
+      resume: continue the run in `config.run_dir`.
+      init_policy: a policy file, a run directory or "released", whose parameters a new run starts from.
+      make_update: makes the learner's program; benchmarks put another in its place.
+    """
+    prepare_jax(config)
+    distributed.join(config)
+    reports = config.distributed.process_id == 0
+    parts = [prepare(stage, make_update) for stage in curriculum.stages(config)]  # also refuses what cannot work
+    learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
+    if init_policy:
+        learner = policies.with_parameters(learner, policies.load_initial(config, init_policy))
+    state = RunState(learner)
+    with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
+        if resume:
+            loaded = checkpoint.load(run.checkpoints, learner)
+            state = RunState(loaded.learner, Progress(**loaded.extra), loaded.blobs)
+            if reports:
+                write_config(run.path, config)  # some settings may differ from now on
+        else:
+            save(config, run.checkpoints, state)  # whatever happens now, --resume has a beginning
+        with (
+            MetricsWriter(run.path, state.progress.iteration) if reports else Silent() as writer,
+            ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else Silent() as printer,
+        ):
+            for part in parts:
+                stopped = distributed.any_process(config, bool(stop))
+                if state.progress.env_steps < part.until_env_steps and not stopped:
+                    state = train_part(part, state, run, stop, [writer.write, printer.update])
+    progress = state.progress
+    log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
+
+
+def prepare(stage: curriculum.Stage, make_update: Callable[..., ppo.Update]) -> Part:
+    """Makes what a stage needs; nothing starts or compiles yet.
+
+    Raises:
+      ConfigError: the settings do not fit together, or this machine.
+    """
+    config, until = stage
+    task, mesh = make_task(config), ppo.make_mesh()
+    collector = make_collector(config, task, mesh)
+    if config.distributed.num_processes > 1:
+        collector = distributed.SharedExperience(config, collector, mesh)
+    return Part(config, until, task, make_update(config, *sizes(task), mesh), collector)
+
+
+def train_part(
+    part: Part, state: RunState, run: RunDirectory, stop: "Stop", report: list[Callable[[Record], None]]
+) -> RunState:
+    """Collects and learns under one configuration until its stage ends or `stop` is true; returns what it saved.
+
+    Args:
+      part: from `prepare`.
+      state: where the run stands.
+      run: takes the checkpoints.
+      stop: asked after every iteration.
+      report: given the metrics of every iteration.
+    """
+    config, until, task, update, collector = part
+    learner, progress, env_states = state
+    reports = config.distributed.process_id == 0
+    with collector:
+        announce(part, run.path, progress)
+        collector.load(list(env_states))
+        while progress.env_steps < until and not distributed.any_process(config, bool(stop)):
+            started = time.monotonic()
+            if not collector.busy:
+                collector.start(learner, progress.iteration, version=progress.iteration)
+            try:
+                experience = collector.finish()
+            except WorkerError:
+                save(config, run.checkpoints, RunState(learner, progress))
+                raise
+            env_steps = progress.env_steps + experience.env_steps
+            if config.schedule == "overlap" and env_steps < until and not stop:
+                collector.start(learner, progress.iteration + 1, version=progress.iteration)
+
+            update_started = time.monotonic()
+            learner, metrics = learn(update, learner, experience, progress.iteration + 1)
+            now = time.monotonic()
+            progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
+            record: Record = {
+                **{"iteration": progress.iteration, "env_steps": env_steps, "train_seconds": progress.seconds},
+                **experience.record,
+                **metrics,
+                "env_steps_per_second": experience.env_steps / (now - started),
+                "wait_seconds": update_started - started,
+                "update_seconds": now - update_started,
+            }
+
+            last = env_steps >= config.total_env_steps
+            if reports and (due(progress.iteration, config.evaluate.every_iterations) or last):
+                record |= test_record(config, task, learner)
+            for give in report:
+                give(record)
+            if due(progress.iteration, config.checkpoint.every_iterations):
+                save(config, run.checkpoints, RunState(learner, progress, collector.save()))
+        state = RunState(learner, progress, collector.save())
+        if not due(progress.iteration, config.checkpoint.every_iterations):
+            save(config, run.checkpoints, state)
+    return state
+
+
+def sizes(task: Task) -> tuple[int, int, Mirror | None]:
+    """What the networks are made from."""
+    return task.observation_size, task.action_size, task.mirror
+
+
+def learn(
+    update: ppo.Update, learner: ppo.LearnerState, experience: Experience, iteration: int
+) -> tuple[ppo.LearnerState, Record]:
+    """One update, finished when this returns.
+
+    Raises:
+      FloatingPointError: it gave parameters that are not finite.
+      LearnerError: it failed; the donated state is lost.
+    """
+    resume = "nothing of it is saved; use --resume"
+    try:
+        learner, result = update(learner, experience.trajectory, experience.replayed)
+        record: Record = {name: float(value) for name, value in result.items()}  # waits for the update to finish
+    except jax.errors.JaxRuntimeError as error:
+        cause = str(error).partition("\n")[0]
+        raise ppo.LearnerError(f"iteration {iteration}: the update failed ({cause}), and {resume}") from error
+    if not record.pop("parameters_finite"):
+        raise FloatingPointError(
+            f"iteration {iteration}: the update gave parameters that are not finite, and {resume} with a lower "
+            "ppo.policy_learning_rate"
+        )
+    return learner, record
+
+
+def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:
+    """Return and length of evaluation episodes with the mean action."""
+    started = time.monotonic()
+    parameters = ppo.export_parameters(learner, config.network.normalize_observations)
+    episodes = run_episodes(config, task, parameters, config.evaluate.episodes, seed=TEST_SEED)
+    return {
+        "episode_return_test": float(episodes.episode_return.mean()),
+        "episode_length_test": float(episodes.episode_length.mean()),
+        "test_seconds": time.monotonic() - started,
+    }
+
+
+def save(config: Config, directory: Path, state: RunState) -> None:
+    """A checkpoint with everything needed to continue; of several processes, the first one writes it."""
+    learner, progress, env_states = state
+    keep = config.checkpoint.keep
+    if config.distributed.process_id == 0:
+        checkpoint.save(directory, progress.iteration, learner, progress._asdict(), list(env_states), keep)
+
+
+def due(iteration: int, every: int) -> bool:
+    """Whether something done every so many iterations (0: never) is to be done after this one."""
+    return every > 0 and iteration % every == 0
+
+
+def announce(part: Part, run_dir: Path, progress: Progress) -> None:
+    """The first lines of a run or stage: what runs where, and how fast the physics is sampled."""
+    config, until, task, _, collector = part
+    devices = ", ".join(str(device) for device in jax.devices())
+    log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
+    log.info(
+        "%s; physics %.0f Hz, policy %.0f Hz",
+        collector.description,
+        1 / task.model.opt.timestep,
+        1 / task.env_step_s,
+    )
+    after = f", continuing after iteration {progress.iteration}" if progress.iteration else ""
+    end = f", stage until {until:,} environment steps" if config.stages else ""
+    log.info("run directory %s%s%s", run_dir, after, end)
+
+
+class Stop:
+    """True once a stop was requested."""
+
+    requested = False
+
+    def __bool__(self) -> bool:
+        return self.requested
+
+
+@contextmanager
+def stop_signal() -> Iterator[Stop]:
+    """Turns the first Ctrl-C, SIGTERM or SIGHUP into a request to stop after the iteration; the second acts at once."""
+    stop = Stop()
+
+    def request(number: int, frame: FrameType | None) -> None:
+        if stop:
+            raise KeyboardInterrupt
+        stop.requested = True
+        log.info("%s: finishing this iteration, then saving; once more stops at once", signal.Signals(number).name)
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup has it ignored
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, request) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    cli.log_to_terminal()
+    return cli.run(lambda: train(*cli.parse_train(sys.argv[1:] if argv is None else argv)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""Figures of training runs on disk: `python -m hasrl_jax.figures fig3 --run-dir DIR`.
+
+fig3   episode return in training and testing, mean ratio, entropy (paper Fig. 3)
+fig4   mean ratio and episode return of several runs, named by what differs in them (paper Fig. 4)
+curve  episode length and return against environment steps and against time
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hasrl_jax.cli import parsing as cli
+from hasrl_jax.cli.options import OneLineParser, require_writable
+from hasrl_jax.config.schema import Config, ConfigError, to_dict
+from hasrl_jax.runs.directory import METRICS_FILE, RunError, load_run_config
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Series = dict[str, np.ndarray]
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+SMOOTHED = 9  # iterations in the moving mean that is drawn over the raw values of fig4
+DPI = 110
+
+
+def read_metrics(run_dir: Path) -> Series:
+    """Every metric of a run by name, [iterations]; NaN where an iteration has none.
+
+    Raises:
+      RunError: the file is missing, damaged or empty.
+    """
+    path = run_dir / METRICS_FILE
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        records = [json.loads(line) for line in lines]
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise RunError(f"{path}: damaged ({error})") from None
+    if not records:
+        raise RunError(f"{path}: holds no iteration yet")
+    names = {name for record in records for name, value in record.items() if isinstance(value, int | float | None)}
+    return {name: np.array([_number(record.get(name)) for record in records]) for name in sorted(names)}
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def differences(configs: list[Config]) -> list[str]:
+    """What tells runs apart, "policy_learning_rate 0.0006": one text per run, empty where nothing does."""
+    flat = [dict(_leaves(to_dict(config))) for config in configs]
+    ignored = ("run_dir", "total_env_steps", "evaluate.", "checkpoint.", "seed")
+    names = [n for n in flat[0] if not n.startswith(ignored) and len({repr(values[n]) for values in flat}) > 1]
+    return [", ".join(f"{name.rpartition('.')[2]} {values[name]}" for name in names) for values in flat]
+
+
+def _leaves(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for name, value in values.items():
+        found += _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
+    return found
+
+
+def fig3(runs: list[Series], names: list[str]) -> "Figure":
+    """Paper Fig. 3 of one run."""
+    figure, axes = _axes(3)
+    run, x = runs[0], runs[0]["iteration"]
+    axes[0].plot(x, run["episode_return_train"], color=COLOURS[0], linewidth=0.8, label="training")
+    if "episode_return_test" in run:
+        tested = np.isfinite(run["episode_return_test"])
+        axes[0].plot(x[tested], run["episode_return_test"][tested], color=COLOURS[1], linewidth=1, label="testing")
+    axes[0].legend(fontsize=7)
+    _label(axes[0], "(a) episode return", "iteration")
+    axes[1].plot(x, run["ratio_mean"], color=COLOURS[0], linewidth=0.8)
+    _label(axes[1], "(b) mean ratio", "iteration")
+    axes[2].plot(x, run["entropy"], color=COLOURS[0], linewidth=1)
+    _label(axes[2], "(c) entropy", "iteration")
+    return figure
+
+
+def fig4(runs: list[Series], names: list[str]) -> "Figure":
+    """Paper Fig. 4: one line per run."""
+    figure, axes = _axes(2)
+    for colour, run, name in zip(COLOURS, runs, names, strict=False):
+        for axis, metric in zip(axes, ("ratio_mean", "episode_return_train"), strict=True):
+            axis.plot(run["iteration"], run[metric], color=colour, linewidth=0.4, alpha=0.4)
+            axis.plot(run["iteration"], moving_mean(run[metric]), color=colour, linewidth=1.2, label=name)
+    axes[0].axhline(1.0, color="grey", linewidth=0.6)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=7)
+    _label(axes[0], "(a) mean ratio", "iteration")
+    _label(axes[1], "(b) episode return in training", "iteration")
+    return figure
+
+
+def curve(runs: list[Series], names: list[str]) -> "Figure":
+    """Episode length and return of every run against environment steps and time."""
+    figure, axes = _axes(4)
+    for colour, run, name in zip(COLOURS, runs, names, strict=False):
+        seconds = run.get("train_seconds", np.nancumsum(run["collect_seconds"] + run["update_seconds"]))
+        xs = (run["env_steps"] / 1e6, seconds / 60)
+        for axis, (metric, x) in zip(axes, ((m, x) for m in ("length", "return") for x in xs), strict=True):
+            axis.plot(x, moving_mean(run[f"episode_{metric}_train"]), color=colour, linewidth=1, label=name)
+    for axis, unit in zip(axes, ("million environment steps", "minutes of training") * 2, strict=True):
+        _label(axis, "episode length" if axis in axes[:2] else "episode return", unit)
+    if any(names):
+        axes[0].legend(fontsize=7)
+    return figure
+
+
+def moving_mean(values: np.ndarray, width: int = SMOOTHED) -> np.ndarray:
+    """Mean of the last `width` values that are numbers, [N] -> [N]; NaN until there is one."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, (width - 1, 0), constant_values=np.nan), width)
+    counts = np.isfinite(windows).sum(axis=1)
+    return np.where(counts > 0, np.nansum(windows, axis=1) / np.maximum(counts, 1), np.nan)
+
+
+FIGURES = {"fig3": fig3, "fig4": fig4, "curve": curve}
+
+
+def _axes(number: int) -> tuple["Figure", list["Axes"]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.4 * number, 3.0), layout="constrained")
+    return figure, list(figure.subplots(1, number, squeeze=False)[0])
+
+
+def _label(axis: "Axes", title: str, x: str) -> None:
+    axis.set_title(title, fontsize=10)
+    axis.set_xlabel(x)
+    axis.grid(alpha=0.3)
+
+
+def draw(arguments: list[str]) -> None:
+    """The command.
+
+    Raises:
+      ConfigError: an impossible argument; RunError: a run that cannot be read.
+    """
+    parser = OneLineParser(
+        prog="python -m hasrl_jax.figures",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("name", choices=tuple(FIGURES))
+    parser.add_argument("--run-dir", type=Path, nargs="+", required=True, help="run directories; fig3 takes one")
+    parser.add_argument("--labels", nargs="+", help="a name for each run; default: the settings that differ")
+    parser.add_argument("--out", type=Path, help="the PNG; default: NAME.png")
+    known = parser.parse_args(arguments)
+    out = known.out or Path(f"{known.name}.png")
+    if known.name == "fig3" and len(known.run_dir) > 1:
+        raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; fig3 shows one")
+    if len(known.run_dir) > len(COLOURS):
+        raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; expected at most {len(COLOURS)}")
+    if known.labels and len(known.labels) != len(known.run_dir):
+        raise ConfigError(f"--labels: got {len(known.labels)}; expected one for each of {len(known.run_dir)} runs")
+    require_writable("--out", out, ".png")
+    names = known.labels or differences([load_run_config(run_dir) for run_dir in known.run_dir])
+    FIGURES[known.name]([read_metrics(run_dir) for run_dir in known.run_dir], names).savefig(out, dpi=DPI)
+    print(f"{out}: {known.name} of {', '.join(map(str, known.run_dir))}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    cli.log_to_terminal()
+    return cli.run(lambda: draw(sys.argv[1:] if argv is None else argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

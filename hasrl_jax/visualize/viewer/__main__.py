@@ -1,0 +1,78 @@
+"""The command line of the viewer."""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+
+from hasrl_jax.cli import parsing as cli
+from hasrl_jax.cli.options import OneLineParser, add_policy_options
+from hasrl_jax.config.limits import check_number
+from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.visualize.viewer import browser, native
+from hasrl_jax.visualize.viewer.live import Live, Pace
+
+
+def view(arguments: list[str]) -> None:
+    """The command: loads a policy and shows it until it is interrupted.
+
+    Raises:
+      ConfigError: an impossible argument, or nothing to show it with; RunError, CheckpointError: no policy.
+    """
+    from hasrl_jax.policy.loading import load_policy_parameters, with_physics
+
+    known, rest = _parse(arguments)
+    check_number("--seed", "seed", known.seed)
+    if not 0 <= known.port < 65536:
+        raise ConfigError(f"--port: got {known.port}; expected 0 to 65535")
+    if known.native:
+        native.require_display()
+    else:
+        browser.require_viser()
+        browser.free_port(known.port)
+    config, parameters = load_policy_parameters(known.run_dir, known.policy)
+    config = cli.override_for_policy(with_physics(config, known.physics), rest, "viewer")
+    live = Live(config, parameters, known.seed, known.randomized)
+    if known.native:
+        native.show(live, known.randomized)
+        return
+    page = browser.Browser(live.model, known.port, known.randomized)
+    try:
+        print(f"open {page.url} (this machine only); Ctrl-C ends the viewer", flush=True)
+        loop(live, page, Pace(), lambda: False)
+    except KeyboardInterrupt:
+        print("ended")
+    finally:
+        page.close()
+
+
+def loop(live: Live, page: browser.Browser, pace: Pace, stop: Callable[[], bool]) -> None:
+    """Simulates in real time until `stop`."""
+    while not stop():
+        live.advance(page.controls())
+        page.show(live.view(), pace.share())
+        time.sleep(pace.wait_s(live.step_s))
+
+
+def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    parser = OneLineParser(
+        prog="python -m hasrl_jax.viewer",
+        description="Watch a policy in the browser, command its speed and push it. Physics and cassie settings can be "
+        "overridden: --cassie.randomize.mass-scale 0.8 1.2",
+        allow_abbrev=False,
+    )
+    add_policy_options(parser)
+    parser.add_argument("--randomized", action="store_true", help="begin with a randomised robot")
+    parser.add_argument("--port", type=int, default=8080, help="of the page on 127.0.0.1; 0 takes a free one")
+    parser.add_argument("--native", action="store_true", help="MuJoCo's own window instead of the browser")
+    return parser.parse_known_args(arguments)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    cli.log_to_terminal()
+    return cli.run(lambda: view(sys.argv[1:] if argv is None else argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""The viewer's page: a panel of controls, the robot, a floor. Served on this machine only."""
+
+import contextlib
+import io
+import math
+import socket
+import threading
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.visualize.viewer.live import Controls, Push, View, readout
+from hasrl_jax.visualize.viewer.shapes import shapes
+
+if TYPE_CHECKING:
+    import viser
+
+HOST = "127.0.0.1"  # viser's own default would let the whole network in
+FORWARD_M_S = (-0.5, 4.0)
+LATERAL_M_S = (-0.3, 0.3)
+PUSH_N = (10.0, 400.0)
+DIRECTIONS_DEG = {"to the left": 90.0, "to the right": -90.0, "forward": 0.0, "backward": 180.0}
+FLOOR_M = -0.01  # height of the model's floor
+TILE_M = 1.0
+READOUT_EVERY = 8  # environment steps
+MISSING = 'the viewer in the browser needs the package viser: pip install "hasrl_jax[viewer]"; or use --native'
+
+
+class Browser:
+    """A page with a panel and a scene; opens on construction.
+
+    Args:
+      model: the robot with its visual shapes.
+      port: 0 takes any free one.
+      randomized: how the choice of the robot is set at first.
+
+    Raises:
+      ConfigError: viser is missing, or the port is in use.
+    """
+
+    def __init__(self, model: mujoco.MjModel, port: int, randomized: bool = False):
+        require_viser()
+        import viser
+
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command prints the address
+            self._server = viser.ViserServer(host=HOST, port=free_port(port), label="hasrl_jax", verbose=False)
+        self.url = f"http://{HOST}:{self._server.get_port()}"
+        self._lock = threading.Lock()  # viser calls back on threads of its own
+        self._reset, self._push = False, False
+        self._shown = 0
+        self._origin = np.zeros(3)
+        self._build_panel(randomized)
+        self._build_scene(model)
+
+    def controls(self) -> Controls:
+        """What the panel asks for now; a click counts once."""
+        with self._lock:
+            reset, push = self._reset, self._push
+            self._reset, self._push = False, False
+        return Controls(
+            forward_m_s=float(self._forward.value),
+            lateral_m_s=float(self._lateral.value),
+            paused=bool(self._paused.value),
+            randomized=self._robot.value == "randomised",
+            reset=reset,
+            push=Push(float(self._force.value), DIRECTIONS_DEG[self._direction.value]) if push else None,
+        )
+
+    def show(self, view: View, pace: float) -> None:
+        """Moves the robot; now and then renews the readouts. `pace`: simulated per elapsed time."""
+        pelvis = view.position[1]
+        if self._follow.value:
+            self._origin = np.array([pelvis[0], pelvis[1], 0.0])
+        with self._server.atomic():
+            # The camera stays where the person put it; the world moves under the robot.
+            self._world.position = -self._origin
+            self._floor.position = np.array([*np.round(pelvis[:2] / TILE_M) * TILE_M, FLOOR_M])
+            for body, frame in self._bodies.items():
+                frame.position, frame.wxyz = view.position[body], view.orientation[body]
+            self._show_push(view, pelvis)
+        if self._shown % READOUT_EVERY == 0:
+            rows = "".join(f"| {name} | {value} |\n" for name, value in readout(view, pace))
+            self._readout.content = "| | |\n|---|---|\n" + rows
+        self._shown += 1
+
+    def close(self) -> None:
+        """Stops serving."""
+        self._server.stop()
+
+    def _build_panel(self, randomized: bool) -> None:
+        gui = self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        self._readout = gui.add_markdown("")
+        with gui.add_folder("Command"):
+            self._forward = gui.add_slider("forward m/s", *FORWARD_M_S, step=0.05, initial_value=0.0)
+            self._lateral = gui.add_slider("left m/s", *LATERAL_M_S, step=0.01, initial_value=0.0)
+        with gui.add_folder("Push"):
+            self._force = gui.add_slider("force N", *PUSH_N, step=10.0, initial_value=60.0)
+            self._direction = gui.add_dropdown("direction", tuple(DIRECTIONS_DEG))
+            push = gui.add_button("push")
+        with gui.add_folder("Episode"):
+            robots = ("nominal", "randomised")
+            hint = "takes effect at the next reset"
+            self._robot = gui.add_dropdown("robot", robots, initial_value=robots[randomized], hint=hint)
+            self._paused = gui.add_checkbox("pause", False)
+            self._follow = gui.add_checkbox("camera follows", True)
+            reset = gui.add_button("reset")
+
+        @push.on_click
+        def _(_: object) -> None:
+            with self._lock:
+                self._push = True
+
+        @reset.on_click
+        def _(_: object) -> None:
+            with self._lock:
+                self._reset = True
+
+    def _build_scene(self, model: mujoco.MjModel) -> None:
+        server, scene = self._server, self._server.scene
+        scene.set_up_direction("+z")
+        server.initial_camera.position = (2.2, -2.2, 1.3)
+        server.initial_camera.look_at = (0.0, 0.0, 0.65)
+        self._world = scene.add_frame("/world", show_axes=False)
+        self._floor = scene.add_grid(
+            "/world/floor", 40.0, 40.0, cell_size=TILE_M / 2, section_size=TILE_M, plane_opacity=0.4, fade_distance=25.0
+        )
+        self._bodies: dict[int, viser.FrameHandle] = {}
+        for shape in shapes(model):
+            path = f"/world/{model.body(shape.body).name}"
+            if shape.body not in self._bodies:
+                self._bodies[shape.body] = scene.add_frame(path, show_axes=False)
+            scene.add_mesh_simple(
+                f"{path}/{shape.name}",
+                shape.vertices,
+                shape.faces,
+                color=shape.color,
+                position=shape.position,
+                wxyz=shape.orientation,
+            )
+        points = np.array([[[-1.0, 0.0, 0.0], [-0.25, 0.0, 0.0]]], np.float32)  # ends beside the robot
+        self._arrow = scene.add_arrows(
+            "/world/push", points, (220, 40, 40), shaft_radius=0.02, head_radius=0.05, head_length=0.12, visible=False
+        )
+
+    def _show_push(self, view: View, pelvis: np.ndarray) -> None:
+        self._arrow.visible = view.push is not None
+        if view.push:
+            half = math.radians(view.push.direction_deg) / 2
+            self._arrow.position = pelvis
+            self._arrow.wxyz = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+def require_viser() -> None:
+    """Says what is missing.
+
+    Raises:
+      ConfigError: viser cannot be imported.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(f"{MISSING} ({error})") from None
+
+
+def free_port(port: int) -> int:
+    """`port` if it can be opened on this machine; for 0, one that can.
+
+    Raises:
+      ConfigError: it cannot.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f"--port: got {port}, which cannot be opened ({error}); 0 takes a free one") from None
+        return int(probe.getsockname()[1])

@@ -1,0 +1,90 @@
+"""MuJoCo's own window, with the keyboard for controls."""
+
+import os
+import platform
+import queue
+import time
+
+import mujoco
+
+from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.visualize.viewer.live import Controls, Live, Pace, Push, readout
+
+SPACE, ENTER, BACKSPACE, RIGHT, LEFT, DOWN, UP = 32, 257, 259, 262, 263, 264, 265  # GLFW's key codes
+FORWARD_STEP_M_S = 0.1
+LATERAL_STEP_M_S = 0.05
+PUSH_N = 100.0
+HELP = "arrows: speed; Enter: push; Space: pause; Backspace: reset"
+
+
+class Keys:
+    """Turns pressed keys into controls."""
+
+    def __init__(self, randomized: bool):
+        self._pressed: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._held = Controls(randomized=randomized)
+        self._next_push = Push(PUSH_N, 90.0)
+
+    def press(self, key: int) -> None:
+        """A key went down; called from the window's thread."""
+        self._pressed.put(key)
+
+    def controls(self) -> Controls:
+        """What was asked for so far; a push or a reset counts once, and pushes come from alternating sides."""
+        held, reset, push = self._held, False, None
+        while not self._pressed.empty():
+            key = self._pressed.get()
+            forward = {UP: FORWARD_STEP_M_S, DOWN: -FORWARD_STEP_M_S}.get(key, 0.0)
+            lateral = {LEFT: LATERAL_STEP_M_S, RIGHT: -LATERAL_STEP_M_S}.get(key, 0.0)
+            held = held._replace(
+                forward_m_s=round(held.forward_m_s + forward, 3),
+                lateral_m_s=round(held.lateral_m_s + lateral, 3),
+                paused=held.paused ^ (key == SPACE),
+            )
+            reset = reset or key == BACKSPACE
+            if key == ENTER:
+                push = self._next_push
+                self._next_push = push._replace(direction_deg=-push.direction_deg)
+        self._held = held
+        return held._replace(reset=reset, push=push)
+
+
+def require_display() -> None:
+    """Says what is missing.
+
+    Raises:
+      ConfigError: there is nothing to open a window on.
+    """
+    if platform.system() == "Linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError("--native: needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set")
+
+
+def show(live: Live, randomized: bool) -> None:
+    """Opens the window and simulates until it is closed.
+
+    Raises:
+      ConfigError: no window can be opened here.
+    """
+    require_display()
+    from mujoco import viewer
+
+    keys, pace, data = Keys(randomized), Pace(), mujoco.MjData(live.model)
+    try:
+        window = viewer.launch_passive(
+            live.model, data, key_callback=keys.press, show_left_ui=False, show_right_ui=False
+        )
+    except RuntimeError as error:  # macOS wants the launcher mjpython
+        raise ConfigError(f"--native: {' '.join(str(error).split())}") from None
+    print(HELP)
+    with window:
+        window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
+        while window.is_running():
+            live.advance(keys.controls())
+            view = live.view()
+            with window.lock():
+                data.qpos[:] = view.qpos
+                mujoco.mj_forward(live.model, data)
+            names, values = ("\n".join(column) for column in zip(*readout(view, pace.share()), strict=True))
+            window.set_texts((None, None, names, values))
+            window.sync()
+            time.sleep(pace.wait_s(live.step_s))

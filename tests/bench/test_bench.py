@@ -1,0 +1,137 @@
+"""The benchmarks run from their command line and report what they promise; no figure is judged here."""
+
+import json
+import math
+from pathlib import Path
+
+import jax
+import pytest
+from PIL import Image
+
+from hasrl_jax.bench import mjx, report
+from hasrl_jax.bench.__main__ import main
+from hasrl_jax.config.schema import Config
+
+TINY = """
+task: cartpole
+physics: {timestep_s: 0.005, steps_per_env_step: 2, integrator: Euler}
+network: {hidden_size: 8}
+ppo: {epochs: 1}
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> str:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return str(path)
+
+
+def test_parity_measures_and_writes(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    figures, table = tmp_path / "new" / "parity.json", tmp_path / "new" / "parity.md"
+    arguments = ["--config", tiny, "--states", "4", "--horizons", "3", "1", "--double"]
+    assert main(["parity", *arguments, "--json", str(figures), "--markdown", str(table)]) == 0
+    written = json.loads(figures.read_text())
+    assert written["bench"] == "parity"
+    assert written["versions"].keys() >= {"jax", "mujoco", "mujoco-mjx"}
+    assert written["figures"]["settings"]["precision"] == "float64"
+    assert list(written["figures"]["horizons"]) == ["1", "3"]
+    assert written["figures"]["horizons"]["1"]["observation"]["max"] < 1e-9
+    assert table.read_text() in capsys.readouterr().out
+    assert "| 1 environment step | 3 environment steps |" in table.read_text()
+
+
+def test_mjx_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture, caplog) -> None:
+    figures, picture = tmp_path / "mjx.json", tmp_path / "new" / "mjx.png"
+    arguments = ["--config", tiny, "--num-envs", "16", "--unroll-length", "4", "--rounds", "1"]
+    assert main(["mjx", *arguments, "--json", str(figures), "--plot", str(picture)]) == 0
+    output = capsys.readouterr().out
+    assert "physics steps/s" in output
+    assert "learner share" in output
+    assert "made for accelerators" in caplog.text
+    written = json.loads(figures.read_text())["figures"]
+    assert written["devices"] == 8
+    (cell,) = written["cells"]
+    assert (cell["num_envs"], cell["steps_per_env"], cell["minibatch_trajectories"]) == (16, 4, 8)
+    assert (cell["recompiles"], cell["contact_overflow"], cell["constraint_overflow"]) == (0, 0, 0)
+    assert all(math.isfinite(value) for value in cell.values() if value is not None)
+    assert cell["physics_share"] + cell["policy_share"] + cell["learner_share"] == pytest.approx(1.0)
+    with Image.open(picture) as image:
+        assert image.size[0] > image.size[1] > 300
+
+
+def test_mjx_stops_where_the_memory_ends(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    def cell(config: Config, *_: object) -> dict:
+        if config.mjx.num_envs > 16:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+        return {"num_envs": config.mjx.num_envs, "env_steps_per_second": 1.0}
+
+    monkeypatch.setattr(mjx, "measure_cell", cell)
+    monkeypatch.setattr(mjx, "tables", lambda figures: str([cell["num_envs"] for cell in figures["cells"]]))
+    assert main(["mjx", "--num-envs", "64", "16", "8"]) == 0
+    assert "[8, 16]" in capsys.readouterr().out
+    assert main(["mjx", "--num-envs", "64"]) == 1
+    assert "64 environments do not fit" in capsys.readouterr().err
+
+
+def test_schedules_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    figures, picture = tmp_path / "schedules.json", tmp_path / "new" / "schedules.png"
+    with open(tiny, "a") as file:
+        file.write("collect: {num_workers: 2, envs_per_worker: 2, max_episode_steps: 20}\n")
+    sizes = ["--total-env-steps", "512", "--env-steps-per-iteration", "128", "--unroll-length", "2"]
+    sizes += ["--seeds", "2", "--iterations", "2", "--update-shares", "1", "--target", "1"]
+    arguments = ["schedules", "--config", tiny, *sizes, "--json", str(figures), "--plot", str(picture)]
+    assert main(arguments) == 0
+    output = capsys.readouterr().out
+    assert "2 of 2" in output and "update s (asleep)" in output
+    written = json.loads(figures.read_text())["figures"]
+    assert [(run["schedule"], run["seed"]) for run in written["runs"][:4]] == [
+        *(("sync", 0), ("overlap", 0), ("decoupled", 0)),
+        ("sync", 1),
+    ]
+    for run in written["runs"]:
+        assert run["curve"][-1]["env_steps"] >= 512
+        assert run["env_steps_to_target"] == 128
+        assert run["policy_lag_max"] <= {"sync": 0, "overlap": 1, "decoupled": 4}[run["schedule"]]
+    cells = {cell["schedule"]: cell for cell in written["hiding"]}
+    assert cells["sync"]["ideal_seconds"] == pytest.approx(2 * cells["overlap"]["ideal_seconds"])
+    with Image.open(picture) as image:
+        assert image.size[0] > image.size[1] > 200
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["schedules", "--seeds", "0"], "--seeds"),
+        (["schedules", "--update-shares", "-1"], "--update-shares"),
+        (["schedules", "--total-env-steps", "0"], "total_env_steps"),
+        (["parity", "--states", "0"], "--states"),
+        (["parity", "--horizons", "1", "0"], "--horizons"),
+        (["parity", "--seed", "-1"], "--seed"),
+        (["parity", "--solver-iterations", "0"], "physics.solver_iterations"),
+        (["parity", "--double", "--impl", "warp"], "--double"),
+        (["parity", "--config", "missing.yaml"], "missing.yaml"),
+        (["mjx", "--num-envs", "8", "0"], "--num-envs"),
+        (["mjx", "--num-envs", "12"], "mjx.num_envs"),
+        (["mjx", "--rounds", "0"], "--rounds"),
+        (["mjx", "--impl", "warp"], "mjx.impl"),
+        (["mjx", "--plot", "/dev/null/figure.png"], "/dev/null"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_it(arguments: list[str], named: str, capsys: pytest.CaptureFixture) -> None:
+    assert main(arguments) != 0
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1
+    assert named in errors[0]
+
+
+def test_default_numbers_are_powers_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(mjx.numbers(None)) == [8, 16]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert list(mjx.numbers(None))[:3] == [256, 512, 1024]
+    assert list(mjx.numbers([64, 8, 64])) == [8, 64]
+
+
+def test_tables_line_up() -> None:
+    table = report.format_table(["name", "steps/s"], [["a", 12345.6], ["long", 0.1234]])
+    assert table.splitlines()[2:] == ["a      12,346", "long    0.123"]

@@ -1,0 +1,178 @@
+"""What a configuration refuses, from YAML and from the command line, and what the shipped files state."""
+
+import dataclasses
+import typing
+from collections.abc import Iterator
+
+import pytest
+
+from hasrl_jax.cli import parsing as cli
+from hasrl_jax.config import strict_yaml
+from hasrl_jax.config.limits import LIMITS, check
+from hasrl_jax.config.schema import CONFIG_FOLDER, Config, ConfigError, from_dict, load_yaml, shipped
+
+
+def numeric_fields(settings: type = Config, prefix: str = "") -> Iterator[str]:
+    for name, hint in typing.get_type_hints(settings).items():
+        if dataclasses.is_dataclass(hint):
+            yield from numeric_fields(hint, f"{prefix}{name}.")
+        elif {int, float} & {hint, *typing.get_args(hint)}:
+            yield prefix + name
+
+
+def test_every_numeric_field_has_limits():
+    assert set(LIMITS) == set(numeric_fields())
+    check(Config())
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_no_field_accepts_a_value_outside_its_limits_or_nan(name):
+    *groups, field = name.split(".")
+    low, high = LIMITS[name]
+    for wrong in (low - 1, high * 2 + 1, float("nan"), float("inf"), float("-inf")):
+        groups_of_config = [Config()]
+        for group in groups:
+            groups_of_config.append(getattr(groups_of_config[-1], group))
+        is_range = isinstance(getattr(groups_of_config[-1], field), tuple)
+        changed = dataclasses.replace(groups_of_config.pop(), **{field: (wrong, wrong) if is_range else wrong})
+        for group in reversed(groups):
+            changed = dataclasses.replace(groups_of_config.pop(), **{group: changed})
+        with pytest.raises(ConfigError, match=rf"^{name}: got [^\n]*; expected [^\n]*$"):
+            check(changed)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "--cassie.randomize.mass-scale -1 1",
+        "--cassie.randomize.mass-scale 0 0",
+        "--cassie.randomize.mass-scale 1 0.5",
+        "--cassie.randomize.sliding-friction -1 1",
+        "--cassie.randomize.damping-scale -1 1",
+        "--cassie.randomize.physics-rate-scale 0 0",
+        "--cassie.randomize.physics-rate-scale -1 1",
+        "--cassie.randomize.physics-rate-scale 1 100",
+        "--cassie.randomize.physics-rate-scale 1 5 --cassie.randomize.enabled True",
+        "--cassie.reward.scale nan",
+        "--cassie.reward.velocity=-inf",
+        "--network.initial-log-std nan",
+        "--network.initial-log-std 1000",
+        "--network.hidden-size 1000000000",
+        "--ppo.policy-learning-rate inf",
+        "--ppo.value_learning_rate inf",
+        "--cassie.clock.swing-fraction -3",
+        "--cassie.clock.max-swing-fraction 5",
+        "--cassie.clock.cycle-per-speed-s -2",
+        "--cassie.termination.max-tilt-deg -10",
+        "--cassie.termination.max-tilt-deg 1000",
+        "--cassie.termination.min-height-m 2",
+        "--cassie.command.resample-s -1 1",
+        "--seed 12345678901234567890123",
+        "--seed " + "9" * 5000,
+        "--total-env-steps 1" + "0" * 400,
+        "--collect.max-episode-steps 100000000000000000000",
+        "--collect.worker-timeout-s 0.001",
+        "--collect.num-workers 5000",
+        "--num_workers 5000",
+        "--evaluate.episodes 1000000",
+        "--task hopper",
+        "--backend=tpu_pool",
+        "--ppo.clip",
+        "--ppo.clip wide",
+        "--ppo.clip 0.1 0.2",
+        "--cassie.command.forward-m-s 1",
+        "--ppo.clop 1",
+        "stray",
+    ],
+)
+def test_an_override_that_cannot_work_is_one_line(arguments, capsys):
+    option = arguments.partition(" ")[0].partition("=")[0].lstrip("-")
+    named = option.replace("num_workers", "collect.num_workers") if option == "num_workers" else option
+    with pytest.raises(ConfigError) as caught:
+        cli.override(shipped("cassie_walk"), arguments.split(), "train")
+    message = str(caught.value)
+    if "0.1 0.2" not in arguments:
+        assert named.replace("-", "_") in message.replace("-", "_")
+    assert "\n" not in message
+    assert "─" not in message and "│" not in message
+    assert len(message) < 300
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_refusal_says_what_would_work():
+    base = shipped("cassie_walk")
+    with pytest.raises(ConfigError, match=r"^--ppo\.clop: unknown option; did you mean --ppo\.clip\?$"):
+        cli.override(base, ["--ppo.clop=1"], "train")
+    with pytest.raises(ConfigError, match=r"'hopper'.*'--task'.*'cassie', 'cartpole'"):
+        cli.override(base, ["--task", "hopper"], "train")
+    with pytest.raises(ConfigError, match=r"^ppo\.clip: got 2\.0; expected 0\.001 to 0\.999$"):
+        cli.override(base, ["--ppo.clip", "2"], "train")
+
+
+def test_overrides_still_work(capsys):
+    arguments = "--seed 3 --num-workers=2 --ppo.max_kl 0 --cassie.command.forward-m-s -1 0.5 --schedule overlap"
+    config = cli.override(Config(), [*arguments.split(), "--network.symmetric", "True"], "train")
+    assert (config.seed, config.collect.num_workers, config.ppo.max_kl) == (3, 2, 0.0)
+    assert (config.cassie.command.forward_m_s, config.schedule) == ((-1.0, 0.5), "overlap")
+    assert config.network.symmetric
+    with pytest.raises(SystemExit) as stopped:
+        cli.override(Config(), ["--help"], "train")
+    assert not stopped.value.code
+    assert "--ppo.clip" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["''", "false", "[]", "0", "seed", "{}\n---\n{}"])
+def test_only_an_empty_file_means_the_defaults(text, tmp_path):
+    path = tmp_path / "some.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"some\.yaml"):
+        load_yaml(path)
+    path.write_text("# nothing\n")
+    assert load_yaml(path) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("seed: 1\nseed: 2", "seed is given twice"),
+        ("ppo: {clip: 0.1, epochs: 2, clip: 0.2}", "clip is given twice"),
+        ("ppo: {clip: 1" + "0" * 400 + "}", "ppo.clip"),
+        ("seed: 1" + "0" * 5000, "not valid YAML"),
+        ("seed: 0x" + "f" * 5000, "thousands of digits"),
+        ("seed: 2020-13-45", "not valid YAML"),
+        ("seed: " + "[" * 5000, "not valid YAML"),
+        ("ppo: {clip: 1.0e+400}", "ppo.clip"),
+        ("task: " + "x" * 5000, "config.task"),
+    ],
+)
+def test_odd_yaml_is_one_short_line(text, named, tmp_path):
+    path = tmp_path / "config"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        check(load_yaml(path))
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_the_paper_file_states_every_setting_of_the_published_run():
+    stated = strict_yaml.parse((CONFIG_FOLDER / "paper.yaml").read_text())
+
+    def missing(settings: type, values: dict, prefix: str) -> Iterator[str]:
+        for name, hint in typing.get_type_hints(settings).items():
+            if name not in values:
+                yield prefix + name
+            elif dataclasses.is_dataclass(hint):
+                yield from missing(hint, values[name], f"{prefix}{name}.")
+
+    for group in ("physics", "cassie", "network", "ppo"):
+        assert not list(missing(typing.get_type_hints(Config)[group], stated[group], f"{group}."))
+    reward = shipped("paper").cassie.reward
+    weights = reward.foot_force, reward.foot_velocity, reward.orientation, reward.pelvis_motion, reward.velocity
+    assert sum(weights) + reward.hip_roll + reward.torque_change + reward.action_change == pytest.approx(1.0)
+
+
+def test_from_dict_refuses_numbers_that_are_not_finite():
+    for wrong in (float("nan"), float("inf"), 10**400, "nan"):
+        with pytest.raises(ConfigError, match=r"config\.ppo\.clip: got .*; expected a finite number"):
+            from_dict({"ppo": {"clip": wrong}})

@@ -1,0 +1,162 @@
+"""Evaluation: what counts, and what is refused before the work."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.envs.cpu_engine import CpuEnvs
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.evaluate import rollout as evaluate
+from hasrl_jax.learn import ppo
+from hasrl_jax.policy import loading as policies
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.visualize import render
+
+PHYSICS = {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"}
+CARTPOLE = {"task": "cartpole", "network": {"hidden_size": 8}, "physics": PHYSICS}
+
+
+def save(config: Config, path: Path) -> Path:
+    """A policy file with random parameters."""
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    checkpoint.save_policy(path, ppo.export_parameters(learner), policies.policy_metadata(config))
+    return path
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save(from_dict(CARTPOLE), tmp_path_factory.mktemp("policy") / "cartpole.npz")
+
+
+def test_a_step_that_diverged_does_not_count(policy, monkeypatch):
+    config, parameters = policies.load_policy_parameters(None, policy)
+    config = from_dict({"collect": {"max_episode_steps": 4}}, config)
+    task = make_task(config)
+    step, calls = CpuEnvs.step, []
+
+    def failing(self, state, action, rng):
+        state, result = step(self, state, action, rng)
+        calls.append(1)
+        if len(calls) < 3:
+            return state, result
+        gone = np.array([True, False])
+        broken = result._replace(diverged=gone, truncated=result.truncated & ~gone)
+        return state, broken._replace(reward=np.where(gone, np.nan, 1.0), measures=np.full_like(result.measures, 1e9))
+
+    monkeypatch.setattr(CpuEnvs, "step", failing)
+    episodes = evaluate.run_episodes(config, task, parameters, 2, seed=0)
+    np.testing.assert_array_equal(episodes.diverged, [True, False])
+    np.testing.assert_array_equal(episodes.episode_length, [2, 4])
+    np.testing.assert_array_equal(episodes.reached_cap, [False, True])
+    assert np.isfinite(episodes.episode_return).all()
+    assert np.isnan(episodes.measures[2:, 0]).all()
+    assert evaluate.summarize(episodes, task)["diverged_episodes"] == 1
+
+
+def test_a_speed_error_does_not_cancel_between_commands():
+    nan = np.nan
+    command = [[1, 1, 1, 1, 2, 2], [1, 1, 1, nan, nan, nan], [1, nan, nan, nan, nan, nan]]  # the last two fall
+    speed = [[0, 1, 1.2, 1.1, 0, 1.6], [0, 1, 1.3, nan, nan, nan], [0, nan, nan, nan, nan, nan]]
+    still = np.where(np.isfinite(np.transpose(command)), 0.0, nan)
+    column = {"forward_command": np.transpose(command), "forward_speed": np.transpose(speed)}
+    column |= {"lateral_command": still, "lateral_speed": still}
+    speeds = evaluate.settled_speeds(column, env_step_s=evaluate.SETTLE_S)
+    np.testing.assert_allclose(speeds["forward_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
+    np.testing.assert_allclose(speeds["forward_speed"], [1.225, 1.15, nan])
+    np.testing.assert_allclose(speeds["lateral_speed_error"], [0.0, 0.0, nan])
+    swapped = {"forward_command": still, "forward_speed": still}
+    swapped |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_speed"]}
+    speeds = evaluate.settled_speeds(swapped, env_step_s=evaluate.SETTLE_S)
+    np.testing.assert_allclose(speeds["lateral_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
+
+
+def test_the_command_writes_its_summary(policy, tmp_path, capsys):
+    arguments = ["--policy", str(policy), "--episodes", "2", "--seconds", "0.5", "--json", str(tmp_path / "out.json")]
+    assert evaluate.main([*arguments, "--physics.solver-iterations", "8"]) == 0
+    assert "diverged_episodes" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "out.json").read_text())
+    assert summary["episodes"] == 2
+    assert summary["diverged_episodes"] == 0
+
+
+def test_cassie_is_judged_with_the_physics_of_the_paper(tmp_path, monkeypatch):
+    small = {"network": {"hidden_size": 8}, "physics": {"solver": "CG", "line_search_iterations": 3}}
+    path = save(from_dict(small), tmp_path / "cassie.npz")
+    seen = []
+
+    def stop(config):
+        seen.append(config.physics)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr(evaluate, "make_task", stop)
+    assert evaluate.main(["--policy", str(path)]) == 2
+    physics = seen[0]
+    assert (physics.timestep_s, physics.steps_per_env_step) == (0.0005, 50)
+    assert (physics.solver, physics.integrator) == ("Newton", "Euler")
+    assert (physics.solver_iterations, physics.line_search_iterations) == (50, 50)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--network.hidden-size", "16"], "network"),
+        (["--task", "cassie"], "task"),
+        (["--scorecard", "card"], "is of task cartpole"),
+        (["--backend", "mjx"], "backend"),
+        (["--collect.unroll-length", "3"], "collect"),
+        (["--seconds", "nan"], "--seconds"),
+        (["--seconds", "inf"], "--seconds"),
+        (["--seconds", "-1"], "--seconds"),
+        (["--seconds", "0"], "--seconds"),
+        (["--seconds", "soon"], "--seconds"),
+        (["--episodes", "0"], "--episodes"),
+        (["--seed", "-1"], "--seed"),
+        (["--json", "missing_folder/out.json"], "missing_folder"),
+        (["--json", "."], "--json"),
+        (["--json", "/proc/out.json"], "/proc/out.json"),
+        (["--episode", "3"], "--episode"),
+    ],
+)
+def test_bad_arguments_are_one_line(policy, arguments, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(evaluate, "run_episodes", lambda *_: pytest.fail("the work began"))
+    try:
+        status = evaluate.main(["--policy", str(policy), *arguments])
+    except SystemExit as stopped:
+        status = stopped.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert named in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--network.hidden-size", "16"], "network"),
+        (["--out", "missing_folder/film.mp4"], "missing_folder"),
+        (["--strip", "strip.txt"], "--strip"),
+        (["--seed", "1" + "0" * 30], "--seed"),
+    ],
+)
+def test_render_refuses_the_same(policy, arguments, named, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    known, rest = render._parse(["--policy", str(policy), *arguments])
+    with pytest.raises(ConfigError, match=named):
+        render.render(known, rest)
+    assert not list(tmp_path.iterdir())
+
+
+def test_render_says_what_is_wrong_on_one_line():
+    command = [sys.executable, "-m", "hasrl_jax.render", "--seconds", "soon"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: --seconds: invalid float value: 'soon'\n"

@@ -1,0 +1,134 @@
+"""The scorecard: its rows, what each row plays, and a small one through the command line."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hasrl_jax.config.schema import Config, shipped
+from hasrl_jax.envs.cassie.commands import PUSH_UNIFORMS, draw_push, next_push
+from hasrl_jax.evaluate import rollout as evaluate
+from hasrl_jax.evaluate import scorecard
+from hasrl_jax.evaluate.scorecard import Row
+from hasrl_jax.policy.loading import load_baseline
+
+
+def test_rows_cover_what_is_asked() -> None:
+    rows = scorecard.rows()
+    assert len({(row.title, row.randomized) for row in rows}) == len(rows)
+    for randomized in (False, True):
+        speeds = {row.forward_m_s[0] for row in rows if row.kind == "speed" and row.randomized == randomized}
+        assert speeds == {-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0}
+    assert {row.push_n for row in rows if row.kind == "push"} == {50, 100, 150, 200, 250, 300}
+
+
+def test_a_row_sets_the_task_and_keeps_the_policy_s_own_clock() -> None:
+    trained = shipped("paper")
+    config = scorecard.row_config(trained, Row("changing", (-0.3, 2.0), randomized=True), 60.0)
+    assert config.cassie.clock == trained.cassie.clock
+    assert config.network == trained.network
+    assert config.cassie.command.forward_m_s == (-0.3, 2.0)
+    assert config.cassie.command.resample_s == (2, 6)
+    assert config.cassie.push.force_n == (0, 0)
+    assert config.cassie.termination.min_height_m == 0.6
+    assert config.collect.max_episode_steps == 2400
+    push = scorecard.row_config(trained, Row("push", (1.0, 1.0), push_n=150.0), 60.0)
+    assert push.cassie.push.force_n == (150, 150)
+    assert push.collect.max_episode_steps == 488  # 6 s, up to 1 s more, the push, and 5 s to survive
+    stairs = scorecard.row_config(shipped("cassie_stairs"), Row("speed", (1.0, 1.0)), 60.0)
+    assert stairs.cassie.terrain.kind == "flat"
+
+
+def test_an_episode_meets_one_push() -> None:
+    config = scorecard.row_config(Config(), Row("push", (1.0, 1.0), push_n=150.0), 60.0)
+    settings, step_s = config.cassie.push, config.physics.env_step_s
+    rng = np.random.default_rng(0)
+    push, push_s = draw_push(rng.random((200, PUSH_UNIFORMS)), settings, np)
+    pushed = []
+    for _ in range(config.collect.max_episode_steps):
+        push, push_s = next_push(push, push_s, np.full(200, step_s), rng.random((200, PUSH_UNIFORMS)), settings, np)
+        pushed.append((push_s <= 0) & (push_s > -settings.duration_s))
+    begins = np.diff(np.array(pushed).astype(int), axis=0, prepend=0) > 0
+    np.testing.assert_array_equal(begins.sum(axis=0), 1)
+
+
+def test_pushed_episodes_are_those_up_at_the_push() -> None:
+    row = Row("push", (1.0, 1.0), push_n=150.0)
+    nothing = np.full(4, np.nan)
+    part = {
+        "seconds": np.array([2.0, 7.5, 12.2, 12.2]),
+        "reached_cap": np.array([False, False, True, True]),
+        "diverged": np.zeros(4, bool),
+        "forward_speed": nothing,
+    }
+    summary = scorecard.summarize_row(row, scorecard.row_config(Config(), row, 60.0), [part])
+    assert summary["pushed_episodes"] == 3
+    np.testing.assert_allclose(summary["share_up"]["mean"], 2 / 3)
+    assert summary["forward_speed"]["mean"] is None
+
+
+def test_a_zero_policy_never_acts() -> None:
+    config, parameters = load_baseline("zero", Config())
+    assert not any(array.any() for name, array in parameters.items() if name.startswith("policy/lstm"))
+    episodes = evaluate.run_episodes(config, scorecard.make_task(config), parameters, 2, 0)
+    assert (episodes.seconds < 3).all()
+    _, random = load_baseline("random", Config())
+    assert random["policy/lstm_0_input"].any()
+
+
+def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = [Row("speed", (0.0, 0.0)), Row("speed", (1.0, 1.0)), Row("push", (1.0, 1.0), push_n=50.0)]
+    few += [Row("speed", (0.0, 0.0), randomized=True)]
+    monkeypatch.setattr(scorecard, "rows", lambda: few)
+    monkeypatch.setattr(scorecard, "BATCH", 2)
+    arguments = ["--policy", "released", "--scorecard", str(tmp_path), "--episodes", "3", "--seconds", "4"]
+    assert evaluate.main([*arguments, "--physics", "training", "--against", "zero"]) == 0
+    report = json.loads((tmp_path / "scorecard.json").read_text())
+    assert list(report["policies"]) == ["the released policy", "zero"]
+    rows = report["policies"]["the released policy"]
+    assert [row["title"] for row in rows] == [row.title for row in few]
+    assert all(row["episodes"] == 3 for row in rows)
+    assert rows[1]["share_up"]["mean"] == 1.0
+    assert 0.8 < rows[1]["forward_speed"]["mean"] < 1.2
+    assert report["policies"]["zero"][0]["share_up"]["mean"] == 0.0
+    page = (tmp_path / "scorecard.md").read_text()
+    assert "| 1 m/s | 100 %" in page
+    assert "### zero" in page
+    assert (tmp_path / "scorecard.png").stat().st_size > 10_000
+
+
+def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object) -> Iterator[dict]:
+        yield {"title": "", "randomized": False, "share_up": {"mean": None}}
+        raise KeyboardInterrupt
+
+    zero, random = load_baseline("zero", Config()), load_baseline("random", Config())
+    digest = scorecard._digest(*zero, seconds=4.0)
+    report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": {"zero": digest}, "policies": {"zero": ["a row"]}}
+    (tmp_path / "scorecard.json").write_text(json.dumps(report))
+    monkeypatch.setattr(scorecard, "measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        scorecard.write(tmp_path, {"zero": zero, "random": random}, 3, 4.0, 0, "")
+    kept = json.loads((tmp_path / "scorecard.json").read_text())["policies"]
+    assert kept["zero"] == ["a row"]
+    assert len(kept["random"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
+        (["--against", "zero"], "--against: only a --scorecard compares policies"),
+        (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
+        (["--scorecard", "DIR", "--seconds", "2"], "--seconds: got 2; expected at least 4"),
+        (["--scorecard", "DIR", "--cassie.push.force-n", "0", "9"], "--cassie.push.force-n: a scorecard sets it"),
+    ],
+)
+def test_bad_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+    arguments = [str(tmp_path / "card") if argument == "DIR" else argument for argument in arguments]
+    assert evaluate.main(["--policy", "released", *arguments]) != 0
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1

@@ -1,0 +1,108 @@
+"""The released policy loads from a fresh install and walks."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hasrl_jax.cli import export
+from hasrl_jax.cli import parsing as cli
+from hasrl_jax.config.schema import ConfigError, from_dict, shipped
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.evaluate import rollout as evaluate
+from hasrl_jax.learn import ppo
+from hasrl_jax.policy import loading as policies
+from hasrl_jax.train import loop as train
+
+
+def test_the_released_policy_walks_at_the_commanded_speed() -> None:
+    config, parameters = policies.load_policy_parameters(None, Path("released"))
+    assert sum(path.stat().st_size for path in policies.RELEASED.values()) < 5e6
+    assert config.run_dir == ""
+    command = {"forward_m_s": [1.0, 1.0], "lateral_m_s": [0.0, 0.0], "stand_probability": 0.0, "start_moving": 0.0}
+    changes = {"cassie": {"command": command, "randomize": {"enabled": False}}, "collect": {"max_episode_steps": 240}}
+    config = from_dict(changes, config)
+    task = make_task(config)
+    episodes = evaluate.run_episodes(config, task, parameters, episodes=2, seed=0)
+    assert episodes.reached_cap.all()
+    forward = episodes.measures[120:, :, task.measures.index("forward_speed")]
+    np.testing.assert_allclose(forward.mean(axis=0), 1.0, atol=0.15)
+
+
+def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
+    ground = {
+        "terrain": {"step_height_m": [0.1, 0.1]},
+        "command": {"forward_m_s": [0.5, 0.5], "stand_probability": 0.0},
+    }
+    stairs, its_parameters = policies.load_policy_parameters(None, "released-stairs")
+    config = from_dict({"cassie": ground, "collect": {"max_episode_steps": 320}}, stairs)
+    task = make_task(config)
+    _, other_parameters = policies.load_policy_parameters(None, "released")
+    assert evaluate.run_episodes(config, task, its_parameters, episodes=3, seed=0).reached_cap.all()
+    assert not evaluate.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
+
+
+def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(tmp_path: Path) -> None:
+    run, out = tmp_path / "run", tmp_path / "policy.npz"
+    small = ["--collect.envs-per-worker", "2", "--collect.env-steps-per-iteration", "256", "--num-workers", "1"]
+    config = Path(__file__).parents[2] / "configs" / "cartpole.yaml"
+    arguments = ["--config", str(config), "--run-dir", str(run), "--total-env-steps", "256", *small]
+    assert train.main([*arguments, "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2"]) == 0
+    assert export.main(["--run-dir", str(run), "--out", str(out)]) == 0
+    exported, from_run = policies.load_policy_parameters(None, out)[1], policies.load_policy_parameters(run, None)[1]
+    assert exported.keys() == from_run.keys()
+    for name, array in exported.items():
+        np.testing.assert_array_equal(array, from_run[name])
+
+    second = tmp_path / "second"
+    arguments[arguments.index(str(run))] = str(second)
+    still = ["--ppo.policy-learning-rate", "1e-12", "--ppo.value-learning-rate", "1e-12", "--seed", "9"]
+    more = ["--init-policy", str(out), "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2", *still]
+    assert train.main([*arguments, *more]) == 0
+    for name, array in policies.load_policy_parameters(second, None)[1].items():
+        # One iteration's observations move statistics that count as a million a little.
+        np.testing.assert_allclose(array, exported[name], atol=1e-2 if "normalizer" in name else 1e-6, err_msg=name)
+    record = json.loads((second / "metrics.jsonl").read_text().splitlines()[0])
+    assert record["iteration"] == 1
+    np.testing.assert_allclose(record["ratio_first"], 1.0, atol=1e-4)
+
+
+def test_a_learner_given_a_policy_acts_as_it_does() -> None:
+    config = shipped("cassie_stairs")
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    released = policies.load_initial(config, "released")
+    given = policies.with_parameters(learner, released)
+    assert jax.tree.structure(given) == jax.tree.structure(learner)
+    for ours, theirs in zip(jax.tree.leaves(given), jax.tree.leaves(learner), strict=True):
+        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+    exported = ppo.export_parameters(given, config.network.normalize_observations)
+    assert exported.keys() == released.keys()
+    for name, array in exported.items():
+        np.testing.assert_allclose(array, released[name], rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"network": {"hidden_size": 32}}, "network.hidden_size: got 32; .* needs --network.hidden_size 64"),
+        ({"network": {"symmetric": False}}, "network.symmetric: got False; .* needs --network.symmetric True"),
+        ({"task": "cartpole"}, "--init-policy released: a policy for task cassie; this run's is cartpole"),
+    ],
+)
+def test_a_policy_of_another_shape_is_refused_in_one_line(changes: dict, named: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{named}$"):
+        policies.load_initial(from_dict(changes, shipped("cassie_stairs")), "released")
+
+
+def test_a_resumed_run_takes_no_other_policy(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--init-policy and --resume"):
+        cli.parse_train(["--resume", str(tmp_path), "--init-policy", "released"])
+
+
+def test_no_source_is_the_released_policy() -> None:
+    released = policies.load_policy_parameters(None, "released")[1]
+    for name, array in policies.load_policy_parameters(None, None)[1].items():
+        np.testing.assert_array_equal(array, released[name], err_msg=name)

@@ -1,0 +1,159 @@
+"""A run directory belongs to one run and one process, and says so when it cannot be used."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hasrl_jax.config.schema import Config, dump_yaml, from_dict
+from hasrl_jax.runs.directory import RunDirectory, RunError, load_run_config, open_run
+
+HOLD = """
+import sys, time
+from hasrl_jax.config.schema import from_dict
+from hasrl_jax.runs.directory import open_run
+with open_run(from_dict({"run_dir": sys.argv[1]}), resume=False):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def disk_full(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def config_for(path: Path, **changes: object) -> Config:
+    return from_dict({"run_dir": str(path), "collect": {"num_workers": 3}, **changes})
+
+
+def test_new_run_and_resume(tmp_path: Path) -> None:
+    config = config_for(tmp_path / "a" / "run", task="cartpole")
+    with open_run(config, resume=False) as run:
+        assert run == RunDirectory(tmp_path / "a" / "run")
+        assert run.checkpoints == run.path / "checkpoints" and run.checkpoints.is_dir()
+        assert load_run_config(run.path) == config
+    with open_run(config, resume=True) as run:
+        assert run.path == tmp_path / "a" / "run"
+
+
+def test_default_names_are_never_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with open_run(Config(), resume=False) as first, open_run(Config(), resume=False) as second:
+        assert first.path != second.path
+        assert all(run.path.match("runs/cassie-20*-*") for run in (first, second))
+
+
+def test_refuses_a_second_run_in_the_same_directory(tmp_path: Path) -> None:
+    config = config_for(tmp_path)
+    with open_run(config, resume=False):
+        pass
+    before = (tmp_path / "config.yaml").read_bytes()
+    with pytest.raises(RunError, match=f"{tmp_path}: already holds a run; continue it with --resume"):
+        open_run(config_for(tmp_path, seed=5), resume=False).__enter__()
+    assert (tmp_path / "config.yaml").read_bytes() == before
+    (tmp_path / "config.yaml").unlink()
+    (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n')
+    with pytest.raises(RunError, match="holds parts of a run"):
+        open_run(config, resume=False).__enter__()
+
+
+def test_a_failed_start_does_not_block_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_for(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", disk_full)
+        with pytest.raises(RunError, match=r"config\.yaml: cannot be written: No space left on device"):
+            open_run(config, resume=False).__enter__()
+    with open_run(config, resume=False):
+        pass
+
+
+def test_lock_is_exclusive_and_ends_with_its_holder(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=root)
+    assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+    try:
+        for resume in (True, False):
+            with pytest.raises(RunError, match=f"{tmp_path}: in use by another run, process {holder.pid}$"):
+                open_run(config_for(tmp_path), resume).__enter__()
+    finally:
+        holder.send_signal(signal.SIGKILL)
+        holder.wait()
+        holder.stdout.close()
+    with open_run(config_for(tmp_path), resume=True):
+        assert (tmp_path / "run.lock").read_text() == str(os.getpid())
+
+
+def test_children_do_not_inherit_the_lock(tmp_path: Path) -> None:
+    config = config_for(tmp_path)
+    with open_run(config, resume=False):
+        child = subprocess.Popen(["sleep", "60"])
+    try:
+        with open_run(config, resume=True):
+            pass
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_missing_and_foreign_directories(tmp_path: Path) -> None:
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "notes.txt").write_text("mine")
+    for name, message in (("missing", "there is no such run directory"), ("foreign", "not a run directory")):
+        for use in (load_run_config, lambda path: open_run(config_for(path), resume=True).__enter__()):
+            with pytest.raises(RunError, match=f"{tmp_path / name}: {message}"):
+                use(tmp_path / name)
+    assert not (tmp_path / "missing").exists()
+    assert [path.name for path in (tmp_path / "foreign").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: text[: len(text) // 2],
+        lambda text: text[:-2],
+        lambda text: text.replace("task:", "tusk:"),
+        lambda text: text.replace("clip: 0.2", "clip: 7.0"),
+        lambda text: text.replace("seed: 0", "seed: [0"),
+        lambda text: "- 1\n",
+        lambda text: "\udcff",
+    ],
+)
+def test_damaged_configuration(tmp_path: Path, damage) -> None:
+    text = damage(dump_yaml(Config()))
+    (tmp_path / "config.yaml").write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(RunError, match=rf"^{tmp_path}/config\.yaml: [^\n]+$"):
+        load_run_config(tmp_path)
+
+
+def test_a_configuration_from_before_a_setting_existed_is_read(tmp_path: Path) -> None:
+    config = config_for(tmp_path)
+    whole = dump_yaml(config)
+    begin, end = whole.index("decoupled:\n"), whole.index("evaluate:\n")
+    (tmp_path / "config.yaml").write_text(whole[:begin] + whole[end:])
+    assert load_run_config(tmp_path) == config
+
+
+def test_directory_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for name in ("file", "file/run"):
+        with pytest.raises(RunError, match=f"{tmp_path / name}: the run directory cannot be created: "):
+            open_run(config_for(tmp_path / name), resume=False).__enter__()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not bind the superuser")
+def test_no_write_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(RunError, match=f"{tmp_path}: cannot be written: Permission denied"):
+        open_run(config_for(tmp_path), resume=False).__enter__()
+
+
+def test_write_permission_is_proved_by_writing(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("")
+    with pytest.raises(RunError, match=f"{tmp_path}/checkpoints: cannot be written: File exists"):
+        open_run(config_for(tmp_path), resume=False).__enter__()
+    assert not (tmp_path / "config.yaml").exists()

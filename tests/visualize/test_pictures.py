@@ -1,0 +1,112 @@
+"""Pictures: what is recorded, what is read out of it, and the files."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.learn import ppo
+from hasrl_jax.policy import loading as policies
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.visualize.pictures import __main__ as pictures
+from hasrl_jax.visualize.pictures import gait, rewards
+from hasrl_jax.visualize.pictures.record import Recording, record
+
+
+def _random_policy(config: Config) -> dict[str, np.ndarray]:
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    return ppo.export_parameters(learner)
+
+
+SMALL = from_dict({"network": {"hidden_size": 8}})
+
+
+def test_records_the_commands_in_turn() -> None:
+    recording = record(SMALL, _random_policy(SMALL), [0.5, 1.0], 0.1)
+    np.testing.assert_array_equal(recording.measures["forward_command"], [0.5] * 4 + [1.0] * 4)
+    np.testing.assert_allclose(recording.time_s, 0.025 * np.arange(1, 9))
+    assert set(recording.reward_terms) == set(make_task(SMALL).reward_terms)
+    assert not recording.fell
+    fallen = record(SMALL, _random_policy(SMALL), [1.5], 10.0)
+    assert fallen.fell
+    assert len(fallen.time_s) < 400
+    with pytest.raises(ConfigError, match="cartpole"):
+        record(from_dict({"task": "cartpole"}), {}, [0.0], 1.0)
+
+
+def _walk(steps: int) -> Recording:
+    """A robot that does as the clock says: 24 environment steps per cycle, a foot in the air for 8 of them."""
+    index = np.arange(steps)
+    right = np.where(index % 24 < 8, 0.0, 300.0)
+    left = np.where((index + 12) % 24 < 8, 0.0, 300.0)
+    ones = np.ones(steps)
+    measures = {"phase": index % 24 / 24, "left_force": left, "right_force": right, "forward_speed": 0.9 * ones}
+    return Recording(0.025 * (index + 1), measures | {"forward_command": ones}, {}, False)
+
+
+def test_the_window_starts_with_a_cycle_and_says_who_stands() -> None:
+    recording = _walk(280)
+    shown = gait.window(recording)
+    assert recording.measures["phase"][shown][0] == 0
+    assert recording.time_s[shown][0] > gait.SETTLE_S
+    assert len(recording.time_s[shown]) == round(gait.SHOWN_S / 0.025)
+    assert gait.stretches(recording.measures["right_force"][:60] > 0) == [(8, 24), (32, 48), (56, 60)]
+    assert gait.stretches(np.zeros(5, bool)) == []
+    assert gait.title(1.0, recording, slice(0, 240)) == (
+        "commanded 1 m/s, walks 0.90 m/s; both feet down 33 %, none 0 %"
+    )
+    fallen = _walk(40)
+    assert gait.title(2.0, fallen, gait.window(fallen)) == "commanded 2 m/s: fell after 1.0 s"
+
+
+def test_smoothing_over_a_cycle_leaves_the_mean() -> None:
+    smooth = rewards.smooth(np.tile([0.0, 1.0, 2.0], 8), 3)
+    np.testing.assert_allclose(smooth[1:-1], 1.0)
+    assert np.isnan(smooth[[0, -1]]).all()
+    assert np.isnan(rewards.smooth(np.full(3, 2.0), 4)).all()  # a robot that fell at once
+
+
+@pytest.mark.parametrize("name", list(pictures.DRAWINGS))
+def test_the_command_writes_a_small_picture(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = from_dict({"physics": {"timestep_s": 0.0025, "steps_per_env_step": 10}}, SMALL)
+    path, out = tmp_path / "policy.npz", tmp_path / "out.png"
+    checkpoint.save_policy(path, _random_policy(config), policies.policy_metadata(config))
+    monkeypatch.setattr(gait, "record", lambda *_: _walk(280))
+    assert pictures.main([name, "--policy", str(path), "--physics", "training", "--out", str(out)]) == 0
+    with Image.open(out) as picture:
+        assert picture.width == 935
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 8
+    assert out.stat().st_size < 150_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["walk"], "walk"),
+        (["gait", "--out", "gait.pdf"], "--out"),
+        (["gait", "--out", "missing_folder/gait.png"], "missing_folder"),
+        (["gait", "--seed", "-1"], "--seed"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    arguments: list[str],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    try:
+        status = pictures.main(arguments)
+    except SystemExit as stopped:
+        status = stopped.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert named in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,236 @@
+"""The viewer: its state under controls, its pace, its shapes, and a page that only this machine can open."""
+
+import sys
+import urllib.request
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import psutil
+import pytest
+
+from hasrl_jax.config.schema import ConfigError, from_dict
+from hasrl_jax.envs.registry import make_task
+from hasrl_jax.learn import ppo
+from hasrl_jax.policy import loading as policies
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.visualize.render import PUSH_S
+from hasrl_jax.visualize.viewer import __main__ as viewer
+from hasrl_jax.visualize.viewer import browser, native
+from hasrl_jax.visualize.viewer.live import MAX_BEHIND_S, Controls, Live, Pace, Push, readout
+from hasrl_jax.visualize.viewer.shapes import shapes
+
+SMALL = {"network": {"hidden_size": 8}}
+
+
+@pytest.fixture(scope="module")
+def live() -> Live:
+    config = from_dict(SMALL)
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    return Live(config, ppo.export_parameters(learner), seed=0)
+
+
+def test_commands_reach_the_policy_at_once(live: Live) -> None:
+    live.advance(Controls(reset=True, forward_m_s=0.4, lateral_m_s=-0.1))
+    assert live.view().measures["forward_command"] == pytest.approx(0.4)
+    live.advance(Controls(forward_m_s=0.7))
+    measures = live.view().measures
+    assert (measures["forward_command"], measures["lateral_command"]) == (pytest.approx(0.7), 0.0)
+    assert live.view().time_s == pytest.approx(2 * live.step_s)
+
+
+def test_pausing_stops_time_but_a_reset_still_acts(live: Live) -> None:
+    live.advance(Controls(reset=True))
+    before = live.view()
+    live.advance(Controls(paused=True))
+    np.testing.assert_array_equal(live.view().qpos, before.qpos)
+    assert live.view().time_s == before.time_s > 0
+    live.advance(Controls(paused=True, reset=True, randomized=True))
+    assert live.view().time_s == 0
+    assert live.view().randomized
+
+
+def test_a_push_gives_its_momentum_and_ends(live: Live) -> None:
+    def lateral_momentum() -> float:
+        env = live._episode.env
+        physics = env._state.physics[0]
+        data = mujoco.MjData(env.task.model)
+        data.qpos[:], data.qvel[:] = np.split(physics[1:], [env.task.model.nq])
+        mujoco.mj_forward(env.task.model, data)
+        mujoco.mj_subtreeVel(env.task.model, data)
+        return float(data.subtree_linvel[0, 1] * env.task.model.body_mass.sum())
+
+    def play(push: Push | None) -> list[float]:
+        live._episode.env.reset(seed=1)
+        live.advance(Controls(reset=True))
+        live.advance(Controls(push=push))
+        momentum = [lateral_momentum()]
+        for _ in range(round(PUSH_S / live.step_s)):
+            assert live.view().push == push
+            live.advance(Controls())
+            momentum.append(lateral_momentum())
+        assert live.view().push is None
+        return momentum
+
+    alone, pushed = play(None), play(Push(80.0, 90.0))
+    assert pushed[0] - alone[0] == pytest.approx(80.0 * live.step_s, abs=0.3)  # the feet take some of it
+    assert pushed[2] - alone[2] > 2 * 80.0 * live.step_s
+
+
+def test_falls_begin_another_episode_and_are_counted(live: Live) -> None:
+    live.advance(Controls(reset=True))
+    before = live.view().falls
+    for _ in range(400):  # the parameters are random: it cannot walk
+        live.advance(Controls(forward_m_s=1.0, randomized=True))
+        if live.view().falls > before:
+            break
+    assert live.view().falls == before + 1
+    assert live.view().randomized
+    assert live.view().time_s == 0
+
+
+def test_a_randomised_robot_has_steps_of_its_own(live: Live) -> None:
+    live.advance(Controls(reset=True))
+    assert live.step_s == pytest.approx(0.025)
+    durations = set()
+    for _ in range(3):
+        live.advance(Controls(reset=True, randomized=True))
+        durations.add(live.step_s)
+    assert len(durations) == 3
+    assert all(0.6 * 0.025 <= duration <= 1.2 * 0.025 for duration in durations)
+
+
+def test_poses_are_those_of_the_robot(live: Live) -> None:
+    live.advance(Controls(reset=True, forward_m_s=0.3))
+    view = live.view()
+    np.testing.assert_allclose(view.position[1], view.qpos[:3])
+    np.testing.assert_allclose(view.orientation[1], view.qpos[3:7], atol=1e-9)
+
+
+def test_only_the_walking_task_is_shown() -> None:
+    with pytest.raises(ConfigError, match="cartpole"):
+        Live(from_dict(SMALL | {"task": "cartpole"}), {}, seed=0)
+
+
+def test_pace_waits_for_the_clock_and_gives_up_what_it_missed() -> None:
+    now = [100.0]
+    pace = Pace(lambda: now[0])
+    assert pace.wait_s(0.025) == pytest.approx(0.025)
+    now[0] += 0.025
+    assert pace.wait_s(0.025) == pytest.approx(0.025)
+    assert pace.share() == pytest.approx(2.0)  # two steps within one step's time, so far
+    for _ in range(60):  # each step takes twice its time
+        now[0] += 0.05
+        assert pace.wait_s(0.025) < 1e-9
+    assert pace.share() == pytest.approx(0.5, abs=0.02)
+    waits = 0
+    while pace.wait_s(0.025) == 0:
+        waits += 1
+    assert waits <= MAX_BEHIND_S / 0.025  # it does not race to catch up with 1.5 s
+
+
+def test_the_readout_says_when_it_is_behind(live: Live) -> None:
+    live.advance(Controls(reset=True, forward_m_s=0.4))
+    rows = dict(readout(live.view(), 0.5))
+    assert rows["pace"] == "behind: 50% of real time"
+    assert rows["forward"].endswith("of +0.40 m/s")
+    assert dict(readout(live.view(), 1.0))["pace"] == "real time"
+
+
+def test_shapes_have_the_size_that_mujoco_gives_them(live: Live) -> None:
+    pytest.importorskip("trimesh")
+    drawn = shapes(live.model)
+    assert len(drawn) > 40
+    for shape in drawn:
+        aabb = live.model.geom_aabb[int(shape.name.removeprefix("geom-"))]
+        extent = np.abs(shape.vertices).max(axis=0)
+        np.testing.assert_allclose(extent, aabb[3:], rtol=0.02, atol=1e-6, err_msg=shape.name)
+        np.testing.assert_allclose(shape.vertices.min(axis=0), -shape.vertices.max(axis=0), rtol=0.02, atol=1e-6)
+
+
+def test_keys_of_the_native_window() -> None:
+    keys = native.Keys(randomized=True)
+    for key in (native.UP, native.UP, native.LEFT, native.SPACE, native.ENTER, 65):
+        keys.press(key)
+    first = keys.controls()
+    assert first == Controls(0.2, 0.05, paused=True, randomized=True, push=Push(native.PUSH_N, 90.0))
+    assert keys.controls() == first._replace(push=None)
+    for key in (native.SPACE, native.BACKSPACE, native.ENTER, native.DOWN):
+        keys.press(key)
+    second = keys.controls()
+    assert second == Controls(0.1, 0.05, randomized=True, reset=True, push=Push(native.PUSH_N, -90.0))
+
+
+def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live.model, port=0, randomized=True)
+    try:
+        port = int(page.url.rpartition(":")[2])
+        listening = [c.laddr for c in psutil.Process().net_connections() if c.status == psutil.CONN_LISTEN]
+        assert [address.ip for address in listening if address.port == port] == ["127.0.0.1"]
+        with urllib.request.urlopen(page.url, timeout=10) as answer:
+            assert answer.status == 200
+        with pytest.raises(ConfigError, match=f"--port: got {port}"):
+            browser.free_port(port)
+
+        steps = iter(range(20))
+        live.advance(Controls(reset=True))
+        page._forward.value = 0.5
+        viewer.loop(live, page, Pace(), lambda: next(steps, None) is None)
+        view = live.view()
+        assert view.time_s == pytest.approx(21 * 0.025)
+        assert view.measures["forward_command"] == pytest.approx(0.5)
+        np.testing.assert_allclose(page._bodies[1].position, view.position[1])
+        np.testing.assert_allclose(page._world.position[:2], -view.position[1, :2])  # the camera follows
+        assert "| time |" in page._readout.content
+        assert page.controls() == Controls(forward_m_s=0.5, randomized=True)
+        page._push = True
+        assert page.controls().push == Push(60.0, 90.0)
+        assert page.controls().push is None
+    finally:
+        page.close()
+    assert browser.free_port(port) == port  # nothing listens any more
+
+
+def test_without_viser_one_line_says_what_to_install(
+    live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, path = from_dict(SMALL), tmp_path / "policy.npz"
+    checkpoint.save_policy(path, live._parameters, policies.policy_metadata(config))
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert viewer.main(["--policy", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "hasrl_jax[viewer]" in error
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    assert viewer.main(["--policy", str(path), "--native"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "DISPLAY" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--port", "70000"], "--port"),
+        (["--seed", "-1"], "--seed"),
+        (["--port", "x"], "--port"),
+        (["--prt", "1"], "--prt"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    arguments: list[str], named: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(browser, "require_viser", lambda: None)
+    try:
+        status = viewer.main(arguments)
+    except SystemExit as stopped:
+        status = stopped.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert named in error
+    assert error.count("\n") == 1
