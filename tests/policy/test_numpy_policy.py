@@ -1,5 +1,9 @@
 """The workers' forward pass equals the learner's."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -63,3 +67,17 @@ def test_parameter_shapes_are_those_of_the_learner(make_config):
     shapes |= {f"value/{name}": array.shape for name, array in learner.value_params.items()}
     shapes |= {"normalizer/mean": (50,), "normalizer/std": (50,)}
     assert numpy_policy.parameter_shapes(50, 10, make_config("cassie").network) == shapes
+
+
+def test_a_worker_multiplies_matrices_with_its_variables():
+    code = "import numpy as np; a = np.ones((64, 64), np.float32); print((a @ a).sum())"
+    environment = {**os.environ, **numpy_policy.blas_variables()}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.strip()) == (0, "262144.0")
+
+
+@pytest.mark.parametrize(("current", "set_"), [("X86_V4", True), ("AVX512_SKX", True), ("X86_V3", False)])
+def test_only_a_cpu_with_avx_512_is_taken_for_one(monkeypatch, current, set_):
+    found = {"tanh": {"ff": {"current": current, "available": "X86_V4 X86_V3 AVX512_SKX baseline(X86_V2)"}}}
+    monkeypatch.setattr(np.lib.introspect, "opt_func_info", lambda **_: found)
+    assert ("OPENBLAS_CORETYPE" in numpy_policy.blas_variables()) == set_
