@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Array = Any  # numpy.ndarray or jax.Array: the definition code runs on both
+Record = dict[str, float | int | None]  # metrics by name; None where there is nothing to measure
 
 
 class Trajectory(NamedTuple):

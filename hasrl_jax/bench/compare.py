@@ -25,8 +25,9 @@ from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.collectors import Collector, make_collector, prepare_jax
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, ConfigError, available_cores, load_yaml
+from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, available_cores, load_yaml
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 
 # peer -> the distributions that it needs, by the module that each provides

@@ -23,9 +23,10 @@ from hasrl_jax.bench.mjx_plot import plot
 from hasrl_jax.bench.report import claim_file, format_table
 from hasrl_jax.collect.collectors import MjxExperience, prepare_jax
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, ConfigError, load_yaml
+from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, load_yaml
 from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.types import Array
 

@@ -8,7 +8,8 @@ from hasrl_jax.bench import engine_parity as parity
 from hasrl_jax.bench.report import claim_file
 from hasrl_jax.collect.collectors import prepare_jax
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import Config, ConfigError, load_yaml
+from hasrl_jax.config.schema import Config, load_yaml
+from hasrl_jax.errors import ConfigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,8 +19,9 @@ from hasrl_jax.collect.collectors import to_trajectory
 from hasrl_jax.collect.plan import MOST_ENVS, make_plan
 from hasrl_jax.collect.supervisor import CpuPool
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import Config, ConfigError, available_cores
+from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 
 

@@ -21,7 +21,8 @@ import numpy as np
 from hasrl_jax.bench.report import claim_file, format_table
 from hasrl_jax.config import schema as config_module
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import CONFIG_FOLDER, Config, ConfigError, load_yaml
+from hasrl_jax.config.schema import CONFIG_FOLDER, Config, load_yaml
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.runs.directory import METRICS_FILE
 from hasrl_jax.train.loop import train

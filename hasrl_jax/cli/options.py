@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 from typing import NoReturn
 
-from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.errors import ConfigError
 
 
 class OneLineParser(argparse.ArgumentParser):

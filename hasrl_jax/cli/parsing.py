@@ -14,11 +14,11 @@ from typing import Any
 import tyro
 
 from hasrl_jax.cli.options import OneLineParser
-from hasrl_jax.collect.supervisor import WorkerError
 from hasrl_jax.config import curriculum
 from hasrl_jax.config import limits as config_checks
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
+from hasrl_jax.errors import ConfigError, HasrlError
 
 SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
 OVERRIDABLE_FOR_A_POLICY = ("physics", "cassie")  # what can differ from the training of a policy that is played
@@ -102,17 +102,13 @@ def override_for_policy(trained: Config, arguments: list[str], program: str) -> 
 
 
 def run(job: Callable[[], None]) -> int:
-    """Runs a command; expected errors become one line on stderr and exit status 1 (2 for a bad configuration)."""
-    from hasrl_jax.learn.ppo import LearnerError
-    from hasrl_jax.runs.checkpoint import CheckpointError
-    from hasrl_jax.runs.directory import RunError
-
+    """Runs a command; expected errors become one line on stderr and an exit status, see `errors.py`."""
     try:
         job()
-    except ConfigError as error:
+    except HasrlError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (RunError, CheckpointError, WorkerError, LearnerError, FloatingPointError, OSError) as error:
+        return error.exit_status
+    except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except MemoryError as error:

@@ -23,11 +23,11 @@ from hasrl_jax.collect.supervisor import CpuPool
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.mjx_engine import make_engine
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import DivergenceError
 from hasrl_jax.learn import normalize, ppo
 from hasrl_jax.learn.batching import pad_segments
 from hasrl_jax.learn.networks import make_networks
-from hasrl_jax.runs.metrics import Record
-from hasrl_jax.types import Trajectory
+from hasrl_jax.types import Record, Trajectory
 
 log = logging.getLogger("hasrl_jax")
 
@@ -221,7 +221,7 @@ class MjxExperience:
         statistics: Statistics = jax.device_get(sums)  # waits for the collection
         self.busy, self._pending = False, None
         if not statistics.valid_steps:
-            raise FloatingPointError("every MJX environment diverged; the policy's actions are probably not finite")
+            raise DivergenceError("every MJX environment diverged; the policy's actions are probably not finite")
         record = mjx_record(statistics, self.reward_terms) | {"collect_seconds": time.monotonic() - self._started}
         return Experience(trajectory, self.plan.env_steps, record)
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array, Trajectory
 
 log = logging.getLogger("hasrl_jax")

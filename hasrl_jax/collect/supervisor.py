@@ -24,15 +24,12 @@ from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.config.schema import Config, to_dict
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import WorkerError
 from hasrl_jax.policy import numpy_networks as numpy_policy
 
 log = logging.getLogger("hasrl_jax")
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")}
 MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in between
-
-
-class WorkerError(RuntimeError):
-    """Workers cannot be started or keep failing; the message carries the cause."""
 
 
 class _Worker(NamedTuple):

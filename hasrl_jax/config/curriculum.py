@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import yaml
 
 from hasrl_jax.config import limits as config_checks
-from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.errors import ConfigError
 
 CHANGEABLE = ("cassie", "ppo", "evaluate")  # the parts of the configuration that a stage may change
 

@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from hasrl_jax.config.schema import Config, ConfigError, shown
+from hasrl_jax.config.schema import Config, shown
 from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.errors import ConfigError
 
 # Lowest and highest value of every numeric field, both included; of a range, for both of its ends.
 LIMITS: dict[str, tuple[float, float]] = {

@@ -17,6 +17,7 @@ import yaml
 
 from hasrl_jax.config import strict_yaml
 from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.errors import ConfigError
 
 
 def available_cores() -> int:
@@ -33,10 +34,6 @@ def _config_folder() -> Path:
 
 CONFIG_FOLDER = _config_folder()
 DEFAULT_CONFIG = CONFIG_FOLDER / "cassie_walk.yaml"
-
-
-class ConfigError(ValueError):
-    """A configuration value that cannot work; the message names the field, the value and what would work."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from mujoco import rollout
 
 from hasrl_jax.envs.task import Reading, Reset, Task
+from hasrl_jax.errors import DivergenceError
 from hasrl_jax.types import Array
 
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -109,10 +110,10 @@ class CpuEnvs:
           rng: source of the uniform numbers that the task consumes.
 
         Raises:
-          FloatingPointError: an action is not finite.
+          DivergenceError: an action is not finite.
         """
         if not np.isfinite(action).all():
-            raise FloatingPointError("the policy produced an action that is not finite")
+            raise DivergenceError("the policy produced an action that is not finite")
         task = self.task
         physics, reading, diverged = self._simulate(state, task.control(state.task, action, np))
         result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)

@@ -13,13 +13,14 @@ import numpy as np
 
 from hasrl_jax.config import limits as config_checks
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
 from hasrl_jax.envs.registry import RECIPES, TASKS, make_task
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import ConfigError
 
 register()  # so that "hasrl_jax.envs.gymnasium:hasrl_jax/Cassie-v0" also names an environment
 
@@ -133,7 +134,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
           RuntimeError: there is no episode to step.
           ValueError: an action of the wrong shape.
-          FloatingPointError: an action that is not finite.
+          DivergenceError: an action that is not finite.
         """
         if self._state is None or self._ended:
             raise RuntimeError("no episode is running: call reset() first")

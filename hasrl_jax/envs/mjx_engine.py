@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from hasrl_jax.config.schema import ConfigError
 from hasrl_jax.envs.cpu_engine import StepResult
 from hasrl_jax.envs.mjx_physics import Loops, find_loops, mjx, physics_step
 from hasrl_jax.envs.task import Reading, Task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array
 
 LARGEST = mujoco.mjMAXVAL  # C MuJoCo, too, gives up a simulation that holds a larger number

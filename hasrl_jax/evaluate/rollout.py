@@ -11,10 +11,11 @@ import numpy as np
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
 from hasrl_jax.config.limits import check_number
-from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.config.schema import Config, from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy import numpy_networks as numpy_policy
 from hasrl_jax.policy.actor import act, start
 

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax.collect.supervisor import ONE_THREAD
-from hasrl_jax.config.schema import Config, ConfigError, available_cores, from_dict, to_dict
+from hasrl_jax.config.schema import Config, available_cores, from_dict, to_dict
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
 from hasrl_jax.evaluate.page import percent, write_page
 from hasrl_jax.evaluate.rollout import columns, mean_interval, run_episodes, settled_speeds, share_interval

@@ -13,7 +13,8 @@ import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hasrl_jax.config.schema import Config, ConfigError, PPOConfig
+from hasrl_jax.config.schema import Config, PPOConfig
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import networks, normalize
 from hasrl_jax.learn.batching import minibatch_indices
 from hasrl_jax.learn.losses import (
@@ -43,10 +44,6 @@ _POLICY_METRICS = (
     "policy_updates",
     "policy_gradient_norm",
 )
-
-
-class LearnerError(RuntimeError):
-    """The update failed on its device; the message carries the cause."""
 
 
 class LearnerState(NamedTuple):

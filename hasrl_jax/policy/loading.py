@@ -8,12 +8,12 @@ import numpy as np
 
 from hasrl_jax.config import limits as config_checks
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.learn import normalize, ppo
 from hasrl_jax.policy.numpy_networks import parameter_shapes
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.runs.checkpoint import CheckpointError
 from hasrl_jax.runs.directory import CHECKPOINTS_DIRECTORY, load_run_config
 
 _FOLDER = Path(__file__).parent / "released"

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn.ppo import LearnerState
 from hasrl_jax.runs.storage import open_storage
 
@@ -34,10 +35,6 @@ _FILES_DIGEST = "files.sha256"
 _POLICY_METADATA, _POLICY_DIGEST = "__metadata__", "__sha256__"
 
 Signature = dict[str, tuple[str, tuple[int, ...]]]  # name -> (dtype, shape)
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint or policy file cannot be written or read; the message is one line and names the path."""
 
 
 class _DamagedError(Exception):

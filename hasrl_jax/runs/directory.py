@@ -16,17 +16,14 @@ from typing import BinaryIO
 from hasrl_jax.config import limits as config_checks
 from hasrl_jax.config import schema as config_module
 from hasrl_jax.config import strict_yaml
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
+from hasrl_jax.errors import ConfigError, RunError
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 TENSORBOARD_DIRECTORY = "tensorboard"
 CHECKPOINTS_DIRECTORY = "checkpoints"
 LOCK_FILE = "run.lock"
-
-
-class RunError(RuntimeError):
-    """A run directory cannot be used; the message is one line and names the path."""
 
 
 @dataclasses.dataclass(frozen=True)

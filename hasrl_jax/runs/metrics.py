@@ -17,9 +17,8 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
-from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY, RunError
-
-Record = dict[str, float | int | None]
+from hasrl_jax.errors import RunError
+from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY
 
 _COLLECT_METRICS = ("env_steps", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
 _RATE_WINDOW = 20  # iterations over which the speed behind "time left" is measured

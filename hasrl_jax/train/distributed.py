@@ -23,11 +23,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hasrl_jax.collect.collectors import Collector, Experience
-from hasrl_jax.collect.supervisor import WorkerError
-from hasrl_jax.config.schema import Config, ConfigError, DistributedConfig, shown, to_dict
+from hasrl_jax.config.schema import Config, DistributedConfig, shown, to_dict
+from hasrl_jax.errors import ConfigError, WorkerError
 from hasrl_jax.learn import ppo
-from hasrl_jax.runs.metrics import Record
-from hasrl_jax.types import Trajectory
+from hasrl_jax.types import Record, Trajectory
 
 log = logging.getLogger("hasrl_jax")
 SUMS = ("diverged_envs", "workers_lost")

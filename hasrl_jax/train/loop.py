@@ -14,19 +14,19 @@ import jax
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.collectors import Collector, Experience, make_collector, prepare_jax
-from hasrl_jax.collect.supervisor import WorkerError
 from hasrl_jax.config import curriculum
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import DivergenceError, LearnerError, WorkerError
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.directory import RunDirectory, open_run, write_config
-from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, Record, Silent
+from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, Silent
 from hasrl_jax.train import distributed
-from hasrl_jax.types import Mirror
+from hasrl_jax.types import Mirror, Record
 
 log = logging.getLogger("hasrl_jax")
 TEST_SEED = 1_000_003  # apart from every training stream
@@ -182,7 +182,7 @@ def learn(
     """One update, finished when this returns.
 
     Raises:
-      FloatingPointError: it gave parameters that are not finite.
+      DivergenceError: it gave parameters that are not finite.
       LearnerError: it failed; the donated state is lost.
     """
     resume = "nothing of it is saved; use --resume"
@@ -191,9 +191,9 @@ def learn(
         record: Record = {name: float(value) for name, value in result.items()}  # waits for the update to finish
     except jax.errors.JaxRuntimeError as error:
         cause = str(error).partition("\n")[0]
-        raise ppo.LearnerError(f"iteration {iteration}: the update failed ({cause}), and {resume}") from error
+        raise LearnerError(f"iteration {iteration}: the update failed ({cause}), and {resume}") from error
     if not record.pop("parameters_finite"):
-        raise FloatingPointError(
+        raise DivergenceError(
             f"iteration {iteration}: the update gave parameters that are not finite, and {resume} with a lower "
             "ppo.policy_learning_rate"
         )

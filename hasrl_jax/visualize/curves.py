@@ -15,8 +15,9 @@ import numpy as np
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, require_writable
-from hasrl_jax.config.schema import Config, ConfigError, to_dict
-from hasrl_jax.runs.directory import METRICS_FILE, RunError, load_run_config
+from hasrl_jax.config.schema import Config, to_dict
+from hasrl_jax.errors import ConfigError, RunError
+from hasrl_jax.runs.directory import METRICS_FILE, load_run_config
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -176,8 +176,8 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
     """
     from hasrl_jax.cli import parsing as cli
-    from hasrl_jax.config.schema import ConfigError
     from hasrl_jax.envs import gymnasium as gymnasium_env
+    from hasrl_jax.errors import ConfigError
     from hasrl_jax.policy.loading import load_policy_parameters, with_physics
 
     _check(known)
@@ -215,7 +215,7 @@ def _strip(known: argparse.Namespace) -> Path:
 
 def _check(known: argparse.Namespace) -> None:
     from hasrl_jax.config.limits import check_number
-    from hasrl_jax.config.schema import ConfigError
+    from hasrl_jax.errors import ConfigError
 
     for name in ("width", "height"):
         value = getattr(known, name)

@@ -15,8 +15,9 @@ import pytest
 
 from hasrl_jax.collect import supervisor as cpu_pool
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.collect.supervisor import CpuPool, WorkerError
+from hasrl_jax.collect.supervisor import CpuPool
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import WorkerError
 
 
 @pytest.fixture
@@ -138,7 +139,7 @@ def test_saving_survives_a_lost_worker(make_pool, parameters, number):
 
 def test_when_every_worker_raises_the_cause_is_in_the_error(make_pool, parameters, caplog):
     pool = make_pool()
-    with pytest.raises(WorkerError, match=r"(?s)every worker was lost.*FloatingPointError: .*not finite"):
+    with pytest.raises(WorkerError, match=r"(?s)every worker was lost.*DivergenceError: .*not finite"):
         run(pool, parameters | {"policy/mean_bias": np.full(1, np.nan)})
     assert caplog.text.count("Traceback") == 2
     assert len(run(pool, parameters, 1).statistics) == 2

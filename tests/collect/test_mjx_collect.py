@@ -16,11 +16,12 @@ from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.collectors import MjxExperience
 from hasrl_jax.collect.mjx import ActingParameters, CollectorState, MjxCollector, Statistics, make_mjx_plan
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError, from_dict, shipped
+from hasrl_jax.config.schema import Config, from_dict, shipped
 from hasrl_jax.envs.cpu_engine import StepResult
 from hasrl_jax.envs.mjx_engine import make_engine
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task, Transition
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import distributions, normalize, ppo
 from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.learn.ppo import make_mesh

@@ -14,9 +14,10 @@ import pytest
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.collect.ray.cluster import import_ray
 from hasrl_jax.collect.ray.pool import RayPool
-from hasrl_jax.collect.supervisor import MAX_FAILURES, CpuPool, WorkerError
-from hasrl_jax.config.schema import ConfigError, RayConfig
+from hasrl_jax.collect.supervisor import MAX_FAILURES, CpuPool
+from hasrl_jax.config.schema import RayConfig
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError, WorkerError
 
 # Read when Ray is loaded.
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64, "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
@@ -118,7 +119,7 @@ def test_lost_workers_cost_their_own_part_and_are_replaced(make_pool, parameters
 def test_workers_that_raise_end_in_one_error_with_the_cause(make_pool, parameters, caplog):
     pool = make_pool()
     broken = parameters | {"policy/mean_bias": np.full(1, np.nan, np.float32)}
-    with pytest.raises(WorkerError, match=r"^every worker was lost.* raised FloatingPointError: .*not finite$"):
+    with pytest.raises(WorkerError, match=r"^every worker was lost.* raised DivergenceError: .*not finite$"):
         run(pool, broken)
     assert caplog.text.count("ray::RayWorker.collect") == 2, "the tracebacks are shown"
     assert len(run(pool, parameters, 1).statistics) > 0

@@ -9,7 +9,8 @@ import pytest
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.config import strict_yaml
 from hasrl_jax.config.limits import LIMITS, check
-from hasrl_jax.config.schema import CONFIG_FOLDER, Config, ConfigError, from_dict, load_yaml, shipped
+from hasrl_jax.config.schema import CONFIG_FOLDER, Config, from_dict, load_yaml, shipped
+from hasrl_jax.errors import ConfigError
 
 
 def numeric_fields(settings: type = Config, prefix: str = "") -> Iterator[str]:

@@ -7,7 +7,8 @@ import pytest
 from hasrl_jax.cli.parsing import parse_train
 from hasrl_jax.config import curriculum
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
+from hasrl_jax.errors import ConfigError
 
 STAGES = ["1000 cassie.command.start_moving=0.6", "2e3 cassie.command.forward_m_s=[-0.3,1.0] ppo.clip=0.1"]
 

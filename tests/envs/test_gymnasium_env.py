@@ -11,10 +11,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import hasrl_jax  # noqa: F401 (importing it registers the environments)
-from hasrl_jax.config.schema import ConfigError, from_dict
+from hasrl_jax.config.schema import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.gymnasium import TaskEnv, make
 from hasrl_jax.envs.registration import ENVIRONMENTS
+from hasrl_jax.errors import ConfigError
 
 INFINITE_BOUNDS = "A Box observation space m.* value is"  # positions and velocities have no honest bounds
 

@@ -16,10 +16,11 @@ import pytest
 
 from hasrl_jax.bench import engine_parity as parity
 from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, ConfigError
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState, make_engine
 from hasrl_jax.envs.mjx_physics import find_loops
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 
 CARTPOLE = config_module.from_dict({"task": "cartpole"})
 NUM_ENVS = 4

@@ -7,12 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import ConfigError, from_dict
+from hasrl_jax.config.schema import from_dict
 from hasrl_jax.envs.cassie import terrain
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.mjx_engine import make_engine
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Reading, Reset, Task
+from hasrl_jax.errors import ConfigError
 
 FLOOR_M = -0.01  # where the model has its floor
 

@@ -9,9 +9,10 @@ import jax
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.config.schema import Config, from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies

@@ -9,8 +9,9 @@ import pytest
 
 from hasrl_jax.cli import export
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.config.schema import ConfigError, from_dict, shipped
+from hasrl_jax.config.schema import from_dict, shipped
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies

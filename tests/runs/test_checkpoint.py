@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.ppo import LearnerState, init_learner
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.runs.checkpoint import CheckpointError
 
 EXTRA = {"iteration": 2, "seconds": 0.1, "name": "ü"}
 BLOBS = [b"", bytes(range(256)) * 40, b"\0"]

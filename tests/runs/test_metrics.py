@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 
-from hasrl_jax.runs.directory import RunError
+from hasrl_jax.errors import RunError
 from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, progress_line, tag
 
 

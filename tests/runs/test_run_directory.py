@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from hasrl_jax.config.schema import Config, dump_yaml, from_dict
-from hasrl_jax.runs.directory import RunDirectory, RunError, load_run_config, open_run
+from hasrl_jax.errors import RunError
+from hasrl_jax.runs.directory import RunDirectory, load_run_config, open_run
 
 HOLD = """
 import sys, time

@@ -15,8 +15,9 @@ import two_processes
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.config.schema import ConfigError, DistributedConfig, from_dict
+from hasrl_jax.config.schema import DistributedConfig, from_dict
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.directory import load_run_config

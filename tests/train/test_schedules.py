@@ -19,8 +19,8 @@ from hasrl_jax.collect.decoupled import FreePool
 from hasrl_jax.collect.supervisor import CpuPool
 from hasrl_jax.config import schema as config_module
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import ConfigError
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import distributions, normalize, ppo
 from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.train import loop as train

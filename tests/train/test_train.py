@@ -14,7 +14,8 @@ import pytest
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, ConfigError, load_yaml
+from hasrl_jax.config.schema import DEFAULT_CONFIG, load_yaml
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.train import loop as train
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.schema import Config, dump_yaml, from_dict
-from hasrl_jax.runs.directory import RunError
+from hasrl_jax.errors import RunError
 from hasrl_jax.visualize import curves as figures
 
 

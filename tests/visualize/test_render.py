@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hasrl_jax.config.schema import ConfigError, from_dict
+from hasrl_jax.config.schema import from_dict
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.runs.checkpoint import CheckpointError
 from hasrl_jax.runs.directory import open_run
 from hasrl_jax.visualize import opengl, render
 

@@ -10,8 +10,9 @@ import numpy as np
 import psutil
 import pytest
 
-from hasrl_jax.config.schema import ConfigError, from_dict
+from hasrl_jax.config.schema import from_dict
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint

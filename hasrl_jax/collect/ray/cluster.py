@@ -10,8 +10,9 @@ import threading
 import warnings
 from typing import Any
 
-from hasrl_jax.collect.supervisor import ONE_THREAD, WorkerError
-from hasrl_jax.config.schema import ConfigError, RayConfig
+from hasrl_jax.collect.supervisor import ONE_THREAD
+from hasrl_jax.config.schema import RayConfig
+from hasrl_jax.errors import ConfigError, WorkerError
 from hasrl_jax.policy.numpy_networks import blas_variables
 
 ANSWER_TIMEOUT_S = 10.0

@@ -18,9 +18,10 @@ from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.collect.ray.cluster import connect, environment, import_ray
 from hasrl_jax.collect.ray.worker import RayWorker
-from hasrl_jax.collect.supervisor import MAX_FAILURES, WorkerError
+from hasrl_jax.collect.supervisor import MAX_FAILURES
 from hasrl_jax.config.schema import Config, to_dict
 from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import WorkerError
 
 log = logging.getLogger("hasrl_jax")
 HEARTBEAT = "heartbeat"  # a thread of its own in every worker, which answers while another collects

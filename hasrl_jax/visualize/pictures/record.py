@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.config.schema import Config, from_dict
 from hasrl_jax.envs.gymnasium import TaskEnv, undisturbed
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy.actor import act, start
 from hasrl_jax.policy.numpy_networks import Parameters
 

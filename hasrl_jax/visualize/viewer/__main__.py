@@ -8,7 +8,7 @@ from collections.abc import Callable
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options
 from hasrl_jax.config.limits import check_number
-from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer import browser, native
 from hasrl_jax.visualize.viewer.live import Live, Pace
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer.live import Controls, Push, View, readout
 from hasrl_jax.visualize.viewer.shapes import shapes
 

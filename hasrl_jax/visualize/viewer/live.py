@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.config.limits import LIMITS
-from hasrl_jax.config.schema import Config, ConfigError, from_dict
+from hasrl_jax.config.schema import Config, from_dict
 from hasrl_jax.envs.gymnasium import TaskEnv, undisturbed
 from hasrl_jax.envs.model import load_model
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy.actor import Acting, act, start
 from hasrl_jax.policy.numpy_networks import Parameters
 from hasrl_jax.visualize.render import PUSH_S, SPEED_AVERAGE_S, recent_means

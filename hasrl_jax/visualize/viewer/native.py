@@ -7,7 +7,7 @@ import time
 
 import mujoco
 
-from hasrl_jax.config.schema import ConfigError
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer.live import Controls, Live, Pace, Push, readout
 
 SPACE, ENTER, BACKSPACE, RIGHT, LEFT, DOWN, UP = 32, 257, 259, 262, 263, 264, 265  # GLFW's key codes
