@@ -46,6 +46,22 @@ class Trajectory(NamedTuple):
     policy_version: Array  # [B] int32, version of the parameters that acted
 
 
+# The arrays of a trajectory, wherever they lie: axes behind those of the batch (see the legend), and type.
+STEP_FIELDS: dict[str, tuple[str, str]] = {  # one entry for every environment step
+    "observation": ("O", "float32"),
+    "action": ("A", "float32"),
+    "log_prob": ("", "float32"),
+    "value": ("", "float32"),
+    "reward": ("", "float32"),
+    "is_first": ("", "bool"),
+    "terminated": ("", "bool"),
+    "truncated": ("", "bool"),
+    "bootstrap_value": ("", "float32"),
+    "mask": ("", "bool"),
+}
+SEGMENT_FIELDS = ("initial_carry", "policy_version")  # one entry for every trajectory
+
+
 class Mirror(NamedTuple):
     """The left-right mirror image of observations and actions as signed permutations: M x = sign * x[index]."""
 

@@ -14,7 +14,7 @@ os.environ.setdefault("NPROC", "1")  # with more threads on few cores, the matri
 if _DEVICES not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_DEVICES}".strip()
 
-from hasrl_jax.config import schema as config_module  # noqa: E402
+from hasrl_jax.config.convert import from_dict  # noqa: E402
 from hasrl_jax.config.schema import Config  # noqa: E402
 from hasrl_jax.envs.registry import make_task  # noqa: E402
 from hasrl_jax.policy.numpy_networks import parameter_shapes  # noqa: E402
@@ -34,7 +34,7 @@ def make_config() -> Callable[..., Config]:
             "worker_timeout_s": 20.0,
         }
         network = {"hidden_size": 16, "symmetric": symmetric, "initial_log_std": -0.5}
-        return config_module.from_dict({"task": task, "network": network, "collect": sizes | collect})
+        return from_dict({"task": task, "network": network, "collect": sizes | collect})
 
     return make
 

@@ -16,7 +16,8 @@ from hasrl_jax.bench.physics_limit import PhysicsLimit
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.plan import MOST_ENVS, make_plan
 from hasrl_jax.collect.supervisor import CpuPool
-from hasrl_jax.config.limits import check
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
@@ -28,7 +29,7 @@ ITEMS = ("physics", "inference", "environment", "other")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the collector benchmark."""
-    default = Config()
+    default = from_dict({})
     parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
     parser.add_argument("--num-workers", type=int, nargs="+", default=sorted({1, available_cores()}), metavar="N")
     parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")

@@ -15,20 +15,23 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import metadata
-from pathlib import Path
 
 import jax
 
 from hasrl_jax.bench.collector import PHYSICS, with_physics
 from hasrl_jax.bench.compare_peers import PeerProcess
 from hasrl_jax.bench.report import format_table
-from hasrl_jax.collect.collectors import Collector, make_collector, prepare_jax
+from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, available_cores, load_yaml
+from hasrl_jax.collect.protocol import Collector, Networks
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.files import load_yaml
+from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
+from hasrl_jax.learn.networks import make_networks
+from hasrl_jax.train.devices import prepare_jax
 
 # peer -> the distributions that it needs, by the module that each provides
 NEEDS = {
@@ -53,7 +56,7 @@ UNEQUAL = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the comparison."""
     cores = available_cores()
-    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help="task, sizes and update")
+    parser.add_argument("--config", default="cassie_walk", metavar="FILE", help="task, sizes and update")
     parser.add_argument("--physics", choices=tuple(PHYSICS), help="2 kHz x 50, or 400 Hz x 10; default: the config's")
     parser.add_argument("--hidden-size", type=int, metavar="H", help="width of the networks; default: the config's")
     parser.add_argument("--num-workers", type=int, default=cores, metavar="N", help="sub-processes of ours")
@@ -168,7 +171,8 @@ def speeds(env_steps: int, collect_seconds: float, seconds: float) -> dict[str, 
 def measure_rounds(config: Config, finalists: list[dict], rounds: int) -> list[dict]:
     """Ours, a lone environment and the finalists in turn; medians over the rounds after the first."""
     task, mesh = make_task(config), ppo.make_mesh()
-    collector = make_collector(config, task, mesh)
+    networks = make_networks(config.network, task.observation_size, task.action_size, task.mirror)
+    collector = make_collector(config, task, mesh, Networks(*networks))
     plan = make_plan(config)
     with ExitStack() as stack:
         stack.enter_context(collector)
@@ -204,7 +208,8 @@ def ours(config: Config, collector: Collector) -> tuple[Callable[[], dict[str, f
     def iterate() -> dict[str, float]:
         nonlocal learner, iteration
         started = time.perf_counter()
-        collector.start(learner, iteration, version=iteration)
+        parameters = ppo.acting_parameters(learner, config.network.normalize_observations)
+        collector.start(parameters, iteration, version=iteration)
         experience = collector.finish()
         collected = time.perf_counter()
         learner, metrics = update(learner, experience.trajectory)

@@ -23,7 +23,7 @@ import numpy as np
 
 from hasrl_jax.collect.supervisor import ONE_THREAD
 from hasrl_jax.collect.worker import die_with_parent, reply
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registration import ENVIRONMENTS
 from hasrl_jax.errors import WorkerError
@@ -54,7 +54,7 @@ class PeerProcess:
         )
         theirs.close()
         try:
-            setup = {"name": name, "config": config_module.to_dict(config), "parent": os.getpid()}
+            setup = {"name": name, "config": to_dict(config), "parent": os.getpid()}
             self._send(setup | {"num_envs": num_envs, "env_steps": env_steps})
             if not self._connection.poll(START_TIMEOUT_S):
                 raise WorkerError(f"{self._label} did not start within {START_TIMEOUT_S:g} s")
@@ -223,7 +223,7 @@ def serve(connection: Connection) -> None:
     """Sets up the peer that the first message names, then runs an iteration per message."""
     setup = json.loads(connection.recv_bytes())
     die_with_parent(setup["parent"])
-    config = config_module.from_dict(setup["config"])
+    config = from_dict(setup["config"])
     with PEERS[setup["name"]](config, setup["num_envs"], setup["env_steps"]) as (parameters, iterate):
         reply(connection, {"parameters": parameters})
         while True:

@@ -9,7 +9,9 @@ import jax
 import numpy as np
 
 from hasrl_jax.bench.report import format_table
-from hasrl_jax.config.schema import Config, shipped
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import shipped
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.networks import zero_carry
@@ -39,7 +41,7 @@ def sizes(name: str) -> tuple[Config, int, int]:
         collect = config.collect
         rows = collect.env_steps_per_iteration // collect.unroll_length
         return replace(config, ppo=replace(config.ppo, max_kl=0.0)), rows, collect.unroll_length
-    config = Config()
+    config = from_dict({})
     network = replace(config.network, hidden_size=256, normalize_observations=False)
     settings = replace(config.ppo, epochs=10, minibatch_trajectories=100, max_kl=0.0)
     return replace(config, network=network, ppo=settings), 100, 100

@@ -21,13 +21,17 @@ from jax.sharding import Mesh, PartitionSpec
 
 from hasrl_jax.bench.mjx_plot import plot
 from hasrl_jax.bench.report import claim_file, format_table
-from hasrl_jax.collect.collectors import MjxExperience, prepare_jax
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, Config, load_yaml
+from hasrl_jax.collect.mjx import MjxCollector
+from hasrl_jax.collect.protocol import Networks
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.files import load_yaml
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
+from hasrl_jax.learn.networks import make_networks
+from hasrl_jax.train.devices import prepare_jax
 from hasrl_jax.types import Array
 
 log = logging.getLogger("hasrl_jax")
@@ -37,7 +41,7 @@ ON_CPU = (8, 16)  # environments when there is no accelerator
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the MJX benchmark."""
-    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help="what is measured")
+    parser.add_argument("--config", default="cassie_walk", metavar="FILE", help="what is measured")
     parser.add_argument(
         "--num-envs", type=int, nargs="+", metavar="N", help=f"default: {SMALLEST}, {2 * SMALLEST}, ... while they fit"
     )
@@ -138,14 +142,15 @@ def measure_cell(config: Config, mesh: Mesh, rounds: int) -> dict[str, Any]:
     update = ppo.make_update(config, *sizes, mesh)
     seconds: dict[str, list[float]] = {"physics": [], "collect": [], "update": []}
     overflow = {"contact_overflow": 0, "constraint_overflow": 0}
-    with MjxExperience(config, task, mesh) as collector:
+    with MjxCollector(config, task, mesh, Networks(*make_networks(config.network, *sizes))) as collector:
         steps_per_env = collector.plan.steps_per_env
-        physics = physics_only(collector.collector.engine, mesh, steps_per_env)
+        physics = physics_only(collector.rollout.engine, mesh, steps_per_env)
         for iteration in range(rounds + 1):
             with _timed(seconds["physics"]) as wait_for:
                 wait_for(physics(collector.state.envs))
             with _timed(seconds["collect"]) as wait_for:
-                collector.start(learner, iteration, version=iteration)
+                parameters = ppo.acting_parameters(learner, config.network.normalize_observations)
+                collector.start(parameters, iteration, version=iteration)
                 experience = collector.finish()
                 wait_for(experience.trajectory)
             with _timed(seconds["update"]) as wait_for:
@@ -165,7 +170,7 @@ def measure_cell(config: Config, mesh: Mesh, rounds: int) -> dict[str, Any]:
         "policy_share": (median["collect"] - median["physics"]) / iteration_s,
         "learner_share": median["update"] / iteration_s,
         **{f"{name}_compile_seconds": times[0] - median[name] for name, times in seconds.items()},
-        "recompiles": collector.collector.trace_count + update.trace_count - 2,
+        "recompiles": collector.rollout.trace_count + update.trace_count - 2,
         "peak_memory_mb": _peak_memory_mb(),
         **overflow,
     }

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from hasrl_jax.bench import engine_parity as parity
 from hasrl_jax.bench.report import claim_file
-from hasrl_jax.collect.collectors import prepare_jax
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import Config, load_yaml
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import load_yaml
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.train.devices import prepare_jax
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +42,7 @@ def measure(arguments: argparse.Namespace) -> dict:
         raise ConfigError(f"--seed: got {arguments.seed}; expected 0 or more")
     if arguments.double and arguments.impl == "warp":
         raise ConfigError("--double: Warp computes in float32 only; leave it out")
-    config = load_yaml(arguments.config) if arguments.config else Config()
+    config = load_yaml(arguments.config) if arguments.config else from_dict({})
     if arguments.solver_iterations is not None:
         config = replace(config, physics=replace(config.physics, solver_iterations=arguments.solver_iterations))
     check(config)

@@ -15,11 +15,12 @@ import psutil
 from hasrl_jax.bench import collector
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.buffer import merge
-from hasrl_jax.collect.collectors import to_trajectory
+from hasrl_jax.collect.cpu import to_trajectory
 from hasrl_jax.collect.plan import MOST_ENVS, make_plan
 from hasrl_jax.collect.supervisor import CpuPool
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import Config, available_cores
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
@@ -27,7 +28,7 @@ from hasrl_jax.learn import ppo
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the scaling benchmark."""
-    default = Config()
+    default = from_dict({})
     parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
     parser.add_argument("--num-workers", type=int, nargs="+", default=[1, 2, 4, 8], metavar="N", help="1 always runs")
     parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")

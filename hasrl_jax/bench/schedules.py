@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from hasrl_jax.bench.report import claim_file, format_table
-from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import CONFIG_FOLDER, Config, load_yaml
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import CONFIG_FOLDER, load_yaml
+from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.runs.directory import METRICS_FILE
@@ -86,7 +87,7 @@ def make_config(arguments: argparse.Namespace) -> Config:
         "evaluate": {"every_iterations": 0},
         "checkpoint": {"every_iterations": 0, "keep": 1},
     }
-    config = config_module.from_dict(changes, config)
+    config = from_dict(changes, config)
     check(config)
     return config
 
@@ -120,7 +121,7 @@ def run(config: Config, make_update: Callable[..., Any], **changes: Any) -> Curv
       KeyboardInterrupt: the run was asked to stop.
     """
     with tempfile.TemporaryDirectory() as directory:
-        config = config_module.from_dict(changes | {"run_dir": directory}, config)
+        config = from_dict(changes | {"run_dir": directory}, config)
         with contextlib.redirect_stdout(io.StringIO()):
             train(config, make_update=make_update)
         lines = (Path(directory) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
@@ -155,7 +156,7 @@ def summary(curve: Curve, target: float) -> dict[str, float | None]:
     return {
         "env_steps_to_target": reached["env_steps"] if reached else None,
         "seconds_to_target": reached["train_seconds"] if reached else None,
-        "return_at_end": curve[-1]["episode_return_test"],
+        "return_at_end": curve[-1]["eval_return"],
         "seconds": curve[-1]["train_seconds"],
         "policy_lag": statistics.mean(record["policy_lag"] for record in curve),
         "policy_lag_max": max(record["policy_lag_max"] for record in curve),

@@ -78,7 +78,7 @@ def check_shared_memory() -> Iterator[Check]:
     """Reserves what a default Cassie run shares with its workers."""
     from hasrl_jax.collect import shared_memory
     from hasrl_jax.collect.plan import make_plan
-    from hasrl_jax.config.schema import shipped
+    from hasrl_jax.config.files import shipped
     from hasrl_jax.envs.registry import make_task
 
     config = shipped("cassie_walk")
@@ -111,7 +111,7 @@ def check_worker() -> Iterator[Check]:
 
     from hasrl_jax.collect.plan import make_plan
     from hasrl_jax.collect.supervisor import CpuPool
-    from hasrl_jax.config.schema import from_dict
+    from hasrl_jax.config.convert import from_dict
     from hasrl_jax.envs.registry import make_task
 
     config = from_dict({"collect": {"num_workers": 1, "env_steps_per_iteration": 2048}})

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser
-from hasrl_jax.config import schema as config
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 
@@ -23,7 +23,7 @@ def export(arguments: list[str]) -> None:
     known, rest = parser.parse_known_args(arguments)
     settings, parameters = policies.load_policy_parameters(known.run_dir, None)
     # Where it was trained is nobody's business, and its curriculum is over.
-    settings = cli.override_for_policy(config.from_dict({"run_dir": "", "stages": []}, settings), rest, "export")
+    settings = cli.override_for_policy(from_dict({"run_dir": "", "stages": []}, settings), rest, "export")
     checkpoint.save_policy(known.out, parameters, policies.policy_metadata(settings))
     print(f"{known.out}: {known.out.stat().st_size / 1000:.0f} kB")
 

@@ -6,6 +6,7 @@ that are too old. Nothing grows: a worker has two slots and one copy of the para
 Source: paper section V, future work.
 """
 
+import math
 import threading
 from collections import deque
 from typing import Any, NamedTuple
@@ -13,11 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax.collect.buffer import Collected, merge
-from hasrl_jax.collect.plan import Plan
+from hasrl_jax.collect.cpu import cpu_record, fetch, to_trajectory
+from hasrl_jax.collect.plan import Plan, make_plan
+from hasrl_jax.collect.protocol import Experience, Parameters
 from hasrl_jax.collect.shared_memory import NUM_BUFFERS
 from hasrl_jax.collect.supervisor import CpuPool
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.task import Task
+from hasrl_jax.types import Record
 
 POLL_SECONDS = 0.01  # between looks for a slot that the learner has freed, or for the first parameters
 ANSWER_SECONDS = 0.1  # the longest wait for answers, and so for the end
@@ -60,6 +64,8 @@ class FreePool:
         self._parameters: dict[str, np.ndarray] | None = None  # the newest
         self._version, self._first_stream = 0, 0
         self._at_work: dict[int, int] = {}  # worker -> version it collects with
+        self._settings = 0  # how often the settings of the task have changed
+        self._configured = [0] * plan.num_workers  # which of them each worker collects under
         self._filled = [0] * plan.num_workers  # slots that each worker has filled since the start
         self._taken = [0] * plan.num_workers  # of these, slots that the learner has taken or dropped
         self._finished: deque[Finished] = deque()  # oldest first
@@ -88,6 +94,12 @@ class FreePool:
             if self._parameters is None:
                 self._first_stream = version * STREAMS_APART
             self._parameters, self._version = parameters, version
+
+    def configure(self, config: Config) -> None:
+        """Changes the settings of the task; each worker takes them over before its next slot."""
+        with self._changed:
+            self._pool.config = config
+            self._settings += 1
 
     def take(self, version: int, wait: bool) -> Collected | None:
         """The oldest slots that are fresh enough, as many as there are workers, whichever workers filled them.
@@ -161,6 +173,9 @@ class FreePool:
             for index in range(self._plan.num_workers):
                 full = self._filled[index] - self._taken[index] == NUM_BUFFERS
                 if self._parameters is not None and index not in self._at_work and not full:
+                    if self._configured[index] != self._settings:
+                        self._pool.configure_worker(index)
+                        self._configured[index] = self._settings
                     self._pool.write_parameters(index, self._parameters)
                     self._pool.order(index, self._stream(index), copy=index)
                     self._at_work[index] = self._version
@@ -171,3 +186,68 @@ class FreePool:
 
     def _patience(self) -> float:
         return ANSWER_SECONDS if len(self._at_work) == self._plan.num_workers else POLL_SECONDS
+
+
+class DecoupledCollector:
+    """A `FreePool`: what was finished first, and the newest batch once more while there is no other."""
+
+    busy = False  # its workers always are, and `start` only gives them newer parameters
+
+    def __init__(self, config: Config, task: Task):
+        self.config, self.task, self.plan = config, task, make_plan(config)
+        slots = f"{self.plan.steps_per_worker} environment steps at a time"
+        envs = f"{self.plan.num_workers} free workers x {self.plan.envs_per_worker} environments"
+        self.description = f"{envs}, {slots}, {self.plan.env_steps} for an iteration"
+        self._version = self._batches = self._uses = self._uses_of_newest = 0
+        self._newest: Experience | None = None
+
+    def __enter__(self) -> "DecoupledCollector":
+        self.pool = FreePool(self.config, self.plan, self.task)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.pool.close()
+
+    def start(self, parameters: Parameters, iteration: int, version: int) -> None:
+        self.pool.publish(fetch(parameters), version)
+        self._version = version
+
+    def finish(self) -> Experience:
+        replayable = self._replayable()
+        collected = self.pool.take(self._version, wait=replayable is None)
+        if collected is not None:
+            self._batches, self._uses_of_newest = self._batches + 1, 0
+            env_steps, record = len(collected.fields["mask"]), cpu_record(collected)
+            experience = self._newest = Experience(to_trajectory(collected, self.plan), env_steps, record)
+        elif replayable is not None:
+            unknown: Record = dict.fromkeys(replayable.record)
+            experience = replayable._replace(env_steps=0, record=unknown, replayed=True)
+        self._uses, self._uses_of_newest = self._uses + 1, self._uses_of_newest + 1
+        dropped = self.pool.pop_dropped()
+        counts: Record = {
+            "workers_lost": self.pool.workers_lost,
+            "dropped_stale": dropped.trajectories,
+            "replay_ratio": self._uses / self._batches,
+        }
+        env_steps = experience.env_steps + dropped.env_steps
+        return experience._replace(env_steps=env_steps, record=experience.record | counts)
+
+    def _replayable(self) -> Experience | None:
+        """The newest batch, if it may be used once more."""
+        settings, newest = self.config.decoupled, self._newest
+        within_average = self._uses + 1 <= settings.replay_ratio * self._batches
+        if newest is None or not within_average or self._uses_of_newest >= math.ceil(settings.replay_ratio):
+            return None
+        valid = newest.trajectory.mask.any(axis=1)
+        fresh = self._version - newest.trajectory.policy_version[valid].min(initial=self._version) <= settings.max_lag
+        return newest if fresh else None
+
+    def configure(self, config: Config, task: Task) -> None:
+        self.config, self.task = config, task
+        self.pool.configure(config)
+
+    def save(self) -> list[bytes]:
+        return []
+
+    def load(self, states: list[bytes]) -> None:
+        self.pool.load(states)

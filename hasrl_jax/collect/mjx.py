@@ -5,8 +5,10 @@ and nothing crosses to the host. The trajectories are those of the CPU pool.
 Source: the Anakin design of the Podracer paper (Hessel et al., 2021).
 """
 
+import io
 import logging
 import math
+import time
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from hasrl_jax.collect.protocol import Experience, Networks, Parameters
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState
-from hasrl_jax.errors import ConfigError
-from hasrl_jax.types import Array, Trajectory
+from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState, make_engine
+from hasrl_jax.envs.task import Task
+from hasrl_jax.errors import ConfigError, DivergenceError
+from hasrl_jax.types import Array, Record, Trajectory
 
 log = logging.getLogger("hasrl_jax")
 
@@ -48,8 +52,8 @@ class ActingParameters(NamedTuple):
 
     policy: Any  # parameters of the policy network
     value: Any  # parameters of the value network
-    observation_mean: Array  # [O] of the normaliser
-    observation_std: Array  # [O]
+    observation_mean: Array | None  # [O] of the normaliser; None for both where observations are not normalised
+    observation_std: Array | None  # [O]
 
 
 class CollectorState(NamedTuple):
@@ -115,7 +119,7 @@ def make_mjx_plan(config: Config, num_envs: int, num_devices: int) -> MjxPlan:
     return MjxPlan(num_envs, pieces * collect.unroll_length, collect.unroll_length, config.network.carry_shape)
 
 
-class MjxCollector:
+class MjxRollout:
     """`collect(parameters, state, version) -> (state, trajectory, statistics)`: one iteration's experience.
 
     Args:
@@ -285,3 +289,96 @@ def _statistics(steps: _Step) -> Statistics:
         constraint_overflow=count(steps.overflow[..., 1]),
     )
     return jax.lax.psum(sums, "data")
+
+
+class MjxCollector:
+    """MJX environments on the learner's devices; the trajectories never leave them."""
+
+    def __init__(self, config: Config, task: Task, mesh: Mesh, networks: Networks):
+        self.plan = make_mjx_plan(config, config.mjx.num_envs, mesh.size)
+        self._mesh, self._networks = mesh, networks
+        self.rollout, self.reward_terms = self._make_rollout(config, task), task.reward_terms
+        self.seed = config.seed
+        self.busy, self._started = False, 0.0
+        self._pending: Any = None  # between `start` and `finish`
+        steps = f"{self.plan.env_steps} environment steps per iteration"
+        self.description = f"{self.plan.num_envs} MJX environments ({config.mjx.impl}), {steps}"
+
+    def _make_rollout(self, config: Config, task: Task) -> MjxRollout:
+        """The program; the settings of the task are constants in it."""
+        settings = config.mjx
+        limits = settings.contacts_per_env, settings.constraints_per_env
+        cap = config.collect.max_episode_steps
+        engine = make_engine(task, settings.impl, cap, settings.num_envs // self._mesh.size, *limits)
+        return MjxRollout(self.plan, engine, *self._networks, self._mesh)
+
+    def __enter__(self) -> "MjxCollector":
+        self.state = self.rollout.init(self.seed)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass  # arrays are freed with the object
+
+    def start(self, parameters: Parameters, iteration: int, version: int) -> None:
+        del iteration  # the environments' own keys move on with them
+        # Copied, because the update donates the learner's arrays while this program may still read them.
+        acting = acting_parameters(jax.tree.map(jnp.copy, parameters))
+        self._pending = self.rollout(acting, self.state, version)
+        self.busy, self._started = True, time.monotonic()
+
+    def finish(self) -> Experience:
+        self.state, trajectory, sums = self._pending
+        statistics: Statistics = jax.device_get(sums)  # waits for the collection
+        self.busy, self._pending = False, None
+        if not statistics.valid_steps:
+            raise DivergenceError("every MJX environment diverged; the policy's actions are probably not finite")
+        record = mjx_record(statistics, self.reward_terms) | {"collect_seconds": time.monotonic() - self._started}
+        return Experience(trajectory, self.plan.env_steps, record)
+
+    def configure(self, config: Config, task: Task) -> None:
+        saved = self.save()
+        self.rollout = self._make_rollout(config, task)
+        self.state = self.rollout.init(self.seed)
+        self.load(saved)
+
+    def save(self) -> list[bytes]:
+        if self.busy:
+            return []
+        buffer = io.BytesIO()
+        np.savez(buffer, *(np.asarray(leaf) for leaf in jax.tree.leaves(self.state)))
+        return [buffer.getvalue()]
+
+    def load(self, states: list[bytes]) -> None:
+        leaves, structure = jax.tree.flatten(self.state)
+        saved: list[Any] = []
+        if len(states) == 1:
+            with np.load(io.BytesIO(states[0]), allow_pickle=False) as file:
+                saved = [file[name] for name in file.files]
+        if [array.shape for array in saved] == [leaf.shape for leaf in leaves]:
+            self.state = jax.tree.unflatten(structure, saved)
+        elif states:
+            log.warning("the saved environments are of another number or backend: all episodes begin anew")
+
+
+def acting_parameters(parameters: Parameters) -> ActingParameters:
+    """The learner's parameters by network; a policy whose observations are not normalised has no statistics."""
+
+    def group(name: str) -> Parameters:
+        return {key.removeprefix(name): array for key, array in parameters.items() if key.startswith(name)}
+
+    mean, std = (parameters.get(f"normalizer/{name}") for name in ("mean", "std"))
+    return ActingParameters(group("policy/"), group("value/"), mean, std)
+
+
+def mjx_record(statistics: Statistics, reward_terms: tuple[str, ...]) -> Record:
+    """As `cpu_record`; also counts the steps in which Warp ran out of room."""
+    episodes = int(statistics.episodes)
+    means = statistics.reward_terms / statistics.valid_steps
+    return {
+        "episode_return_train": float(statistics.episode_return) / episodes if episodes else None,
+        "episode_length_train": float(statistics.episode_length) / episodes if episodes else None,
+        "diverged_envs": int(statistics.diverged),
+        "contact_overflow": int(statistics.contact_overflow),
+        "constraint_overflow": int(statistics.constraint_overflow),
+        **{f"reward/{name}": float(mean) for name, mean in zip(reward_terms, means, strict=True)},
+    }

@@ -15,9 +15,12 @@ import psutil
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.config.schema import Config, NetworkConfig
 from hasrl_jax.policy.numpy_networks import Parameters, parameter_shapes
+from hasrl_jax.types import STEP_FIELDS
 
 Specs = dict[str, tuple[tuple[int, ...], str]]  # name -> (shape, dtype)
 ALIGNMENT = 64  # bytes, a cache line
+# Episodes that ended, at the step where they did; zero elsewhere.
+EPISODE_FIELDS = {"episode_return": "float32", "episode_length": "int32"}
 NUM_BUFFERS = 2  # everything is double-buffered: one is written while the other is read
 
 
@@ -75,26 +78,16 @@ def slot_specs(
     num_steps: int, num_segments: int, observation_size: int, action_size: int, carry_shape: tuple[int, ...]
 ) -> Specs:
     """One worker's trajectory buffer: flat steps, and the start and end index of each trajectory in them."""
-    step = (num_steps,)
-    return {
-        "observation": ((num_steps, observation_size), "float32"),
-        "action": ((num_steps, action_size), "float32"),
-        "log_prob": (step, "float32"),
-        "value": (step, "float32"),
-        "reward": (step, "float32"),
-        "is_first": (step, "bool"),
-        "terminated": (step, "bool"),
-        "truncated": (step, "bool"),
-        "bootstrap_value": (step, "float32"),
-        "mask": (step, "bool"),
+    sizes = {"": (), "O": (observation_size,), "A": (action_size,)}
+    steps: Specs = {name: ((num_steps, *sizes[axes]), dtype) for name, (axes, dtype) in STEP_FIELDS.items()}
+    episodes: Specs = {name: ((num_steps,), dtype) for name, dtype in EPISODE_FIELDS.items()}
+    segments: Specs = {
         "initial_carry": ((num_segments, *carry_shape), "float32"),
         "start": ((num_segments,), "int32"),
         "end": ((num_segments,), "int32"),
         "num_segments": ((1,), "int32"),
-        # Episodes that ended, at the step where they did; zero elsewhere.
-        "episode_return": (step, "float32"),
-        "episode_length": (step, "int32"),
     }
+    return steps | segments | episodes
 
 
 def worker_slot_specs(config: Config, plan: Plan, observation_size: int, action_size: int) -> Specs:

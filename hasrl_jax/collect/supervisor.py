@@ -22,7 +22,8 @@ import numpy as np
 from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
-from hasrl_jax.config.schema import Config, to_dict
+from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import WorkerError
 from hasrl_jax.policy import numpy_networks as numpy_policy
@@ -187,6 +188,22 @@ class CpuPool:
                 self._replace(index, failure)
             elif state and not json.loads(reply)["loaded"]:
                 log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+
+    def configure(self, config: Config) -> None:
+        """Changes the settings of the task in every worker; only between `finish` and `start`.
+
+        Episodes go on where the state of the environments keeps its shapes, and begin anew elsewhere.
+        """
+        self.config = config
+        for index in range(self.plan.num_workers):
+            self.configure_worker(index)
+
+    def configure_worker(self, index: int) -> None:
+        """Gives `config`, which has changed, to one worker; it must not be collecting."""
+        self._send(index, {"do": "configure", "config": to_dict(self.config)})
+        _, failure = self._answer(index)
+        if failure is not None:
+            self._replace(index, failure)
 
     def close(self) -> None:
         """Ends all workers and frees the shared memory."""

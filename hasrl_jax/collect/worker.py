@@ -20,13 +20,13 @@ import numpy as np
 
 from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.plan import Plan, make_plan
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.policy import numpy_networks as numpy_policy
-from hasrl_jax.types import Mirror
+from hasrl_jax.types import STEP_FIELDS, Mirror
 
 PR_SET_PDEATHSIG = 1
 VALUE_BATCH = 512  # states whose values are computed at once: few calls, and all of it stays in a core's cache
@@ -65,7 +65,7 @@ class Actor:
         by_env = {
             name: array.reshape(num_envs, horizon, *array.shape[1:])
             for name, array in slot.items()
-            if name not in ("initial_carry", "start", "end", "num_segments")
+            if name in STEP_FIELDS or name in shared_memory.EPISODE_FIELDS
         }
         unroll_carries = []
         sums: dict[str, Any] = {"inference": 0.0, "environment": 0.0}
@@ -216,7 +216,7 @@ def serve(connection: Connection, descriptor: int) -> None:
     """Answers the pool's messages until it says stop or goes away."""
     setup = json.loads(connection.recv_bytes())
     die_with_parent(setup["parent"])
-    config = config_module.from_dict(setup["config"])
+    config = from_dict(setup["config"])
     plan = make_plan(config)
     index = setup["index"]
     actor = Actor(config, plan, index)
@@ -236,6 +236,10 @@ def serve(connection: Connection, descriptor: int) -> None:
             reply(connection, actor.collect(parameters, slot, iteration, beat))
         elif message["do"] == "save":
             connection.send_bytes(actor.save())
+        elif message["do"] == "configure":
+            state = actor.save()
+            actor = Actor(from_dict(message["config"]), plan, index)
+            reply(connection, {"loaded": actor.load(state)})
         elif message["do"] == "load":
             reply(connection, {"loaded": actor.load(connection.recv_bytes())})
 

@@ -1,75 +1,115 @@
-"""A curriculum: settings that change when a run has collected so many environment steps.
+"""A curriculum: settings that change when a run has collected so many environment steps, or can do so much.
 
-Each entry of `Config.stages` reads "STEPS FIELD=VALUE FIELD=VALUE ...", with values written as in YAML and without
-spaces: "2e6 cassie.command.forward_m_s=[-0.3,1.0] cassie.randomize.enabled=true". What a stage sets stays set.
+    stages:
+      - at_env_steps: 4_000_000
+        set: {cassie.command.forward_m_s: [-0.3, 2.0]}
+      - at_env_steps: 6_000_000
+        wait_for: {episode_length_train: 350}
+        set: {cassie.randomize.enabled: true}
+
+What a stage sets stays set. A stage with `wait_for` begins when each metric, averaged over its last ten values, has
+also reached its value; the stages behind it wait as well.
 """
 
-from typing import Any, NamedTuple
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-import yaml
+import numpy as np
 
-from hasrl_jax.config import limits as config_checks
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import Config, StageConfig
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.types import Record
 
-CHANGEABLE = ("cassie", "ppo", "evaluate")  # the parts of the configuration that a stage may change
-
-
-class Stage(NamedTuple):
-    """A part of a run under one configuration."""
-
-    config: Config
-    until_env_steps: int  # it ends when the run has collected so many
+CHANGEABLE = ("ppo", "evaluate")  # what a stage may change besides the task's own settings
+WINDOW = 10  # values of a metric that are averaged
+NOW_AND_THEN = "eval_"  # how the metrics begin that not every iteration has
 
 
-def stages(config: Config) -> list[Stage]:
-    """The whole run in order; a single stage when `config.stages` is empty.
-
-    A stage whose end is not after the end of another before it has nothing left to do.
+def resolve(config: Config) -> list[Config]:
+    """The configuration of every part of the run: before the first stage, and from each stage on.
 
     Raises:
-      ConfigError: an entry that cannot be read, is out of order, or leads to impossible settings; names the entry.
+      ConfigError: a stage is out of order, sets nothing, or leads to impossible settings; names the stage.
     """
-    found: list[Stage] = []
-    begin, current = 0, config
-    for index, text in enumerate(config.stages):
+    resolved, begin = [config], 0
+    for index, stage in enumerate(config.stages):
         name = f"stages[{index}]"
-        at, changes = _parse(text, name)
-        if at <= begin and found:
-            raise ConfigError(f"{name}: begins at {at} environment steps; expected more than {begin}")
-        found.append(Stage(current, min(at, config.total_env_steps)))
-        begin, current = at, _apply(changes, current, name)
-    return [*found, Stage(current, config.total_env_steps)]
+        if stage.at_env_steps <= begin:
+            raise ConfigError(f"{name}.at_env_steps: got {stage.at_env_steps}; expected more than {begin}")
+        if not stage.set:
+            raise ConfigError(f"{name}.set: got nothing; expected fields and values, {{ppo.clip: 0.1}}")
+        begin = stage.at_env_steps
+        resolved.append(_apply(stage.set, resolved[-1], name))
+    return resolved
 
 
-def _parse(text: str, name: str) -> tuple[int, list[tuple[str, Any]]]:
-    """The environment steps and the (dotted field, value) pairs of an entry."""
-    try:
-        first, *settings = text.split()
-        at = int(float(first))
-        pairs = [(field, yaml.safe_load(value)) for field, _, value in (setting.partition("=") for setting in settings)]
-    except (ValueError, OverflowError, yaml.YAMLError):
-        at, pairs = -1, []
-    if at < 0 or not pairs or any(value is None for _, value in pairs):
-        example = '"STEPS FIELD=VALUE ...", as in "2e6 cassie.push.force_n=[0,100]"'
-        raise ConfigError(f"{name}: got {text!r}; expected {example}")
-    return at, pairs
+class Stages:
+    """Finds out when the next stage begins.
+
+    Args:
+      stages: of the run.
+      current: the part that the run is in: 0 before the first stage, i from stage i - 1 on.
+      history: the last values of each metric that stages wait for, as `history` returned them.
+    """
+
+    def __init__(self, stages: tuple[StageConfig, ...], current: int, history: Mapping[str, Iterable[float]]):
+        self._stages, self.current = stages, current
+        names = {name for stage in stages for name in stage.wait_for}
+        self._history = {name: deque(history.get(name, ()), maxlen=WINDOW) for name in sorted(names)}
+
+    def advance(self, env_steps: int, record: Record) -> bool:
+        """Takes the metrics of an iteration; whether another stage has begun with it. One iteration, one stage.
+
+        Raises:
+          ConfigError: a stage waits for a metric that there is none of.
+        """
+        for name, values in self._history.items():
+            if name not in record and not name.startswith(NOW_AND_THEN):
+                raise ConfigError(f"stages: wait_for names {name!r}, which is no metric; known are {', '.join(record)}")
+            value = record.get(name)
+            if value is not None:
+                values.append(float(value))
+        if self.current == len(self._stages):
+            return False
+        stage = self._stages[self.current]
+        reached = all(
+            len(self._history[name]) == WINDOW and np.mean(self._history[name]) >= least
+            for name, least in stage.wait_for.items()
+        )
+        if env_steps < stage.at_env_steps or not reached:
+            return False
+        self.current += 1
+        return True
+
+    def due(self, env_steps: int) -> bool:
+        """Whether the next stage begins after the present iteration, whatever its metrics."""
+        following = self._stages[self.current :][:1]
+        return any(env_steps >= stage.at_env_steps and not stage.wait_for for stage in following)
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """What a checkpoint keeps."""
+        return {name: list(values) for name, values in self._history.items()}
 
 
-def _apply(changes: list[tuple[str, Any]], config: Config, name: str) -> Config:
+def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
     """`config` with some fields replaced, and checked."""
-    for field, value in changes:
+    changeable = (*([config.section] if config.section else []), *CHANGEABLE)
+    for field, value in changes.items():
         parts = field.split(".")
-        if parts[0] not in CHANGEABLE:
-            raise ConfigError(f"{name}: {field} cannot change during a run; {', '.join(CHANGEABLE)} settings can")
+        if parts[0] not in changeable:
+            raise ConfigError(f"{name}.set: {field} cannot change during a run; {', '.join(changeable)} settings can")
         for part in reversed(parts):
             value = {part: value}
         try:
             config = from_dict(value, config)
         except ConfigError as error:
-            raise ConfigError(f"{name}: {error}") from None
+            raise ConfigError(f"{name}.set: {error}") from None
     try:
-        config_checks.check(config)
+        check(config)
     except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
+        raise ConfigError(f"{name}.set: {error}") from None
     return config

@@ -1,23 +1,14 @@
-"""Configuration: frozen dataclasses, strict YAML, and checks that run before anything compiles.
+"""The fields of a configuration: frozen dataclasses with the limits of every number beside it.
 
-A YAML file names only what it changes from the defaults of these classes. Training without `--config` reads
-`configs/cassie_walk.yaml`. Every field is read somewhere, and its comment gives its meaning and unit.
+A YAML file names only what it changes from these defaults. A task's own settings are a further group under the task's
+name, see `config/tasks.py`. Every field is read somewhere, and its comment gives its meaning and unit.
 """
 
-import contextlib
-import dataclasses
-import math
 import os
-import typing
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-import yaml
-
-from hasrl_jax.config import strict_yaml
-from hasrl_jax.envs.cassie.settings import CassieConfig
-from hasrl_jax.errors import ConfigError
+from hasrl_jax.config.limits import Limits, Share
 
 
 def available_cores() -> int:
@@ -25,25 +16,16 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _config_folder() -> Path:
-    """configs/, beside the package in a checkout and inside it in a wheel."""
-    package = Path(__file__).parents[1]
-    folders = package.parent / "configs", package / "configs"
-    return next((folder for folder in folders if folder.is_dir()), folders[0])
-
-
-CONFIG_FOLDER = _config_folder()
-DEFAULT_CONFIG = CONFIG_FOLDER / "cassie_walk.yaml"
-
-
 @dataclass(frozen=True)
 class PhysicsConfig:
-    timestep_s: float = 0.0025  # physics step, seconds (the paper: 0.0005)
-    steps_per_env_step: int = 10  # physics steps per environment (policy) step (the paper: 50)
+    timestep_s: Annotated[float, Limits(1e-5, 0.01)] = 0.0025  # physics step, seconds (the paper: 0.0005)
+    # physics steps per environment (policy) step (the paper: 50)
+    steps_per_env_step: Annotated[int, Limits(1, 10_000)] = 10
     solver: Literal["Newton", "CG", "PGS"] = "Newton"  # constraint solver
     integrator: Literal["Euler", "implicitfast"] = "implicitfast"  # implicitfast is stable at 2.5 ms
-    solver_iterations: int = 4  # constraint solver iterations, at most
-    line_search_iterations: int = 8  # line-search iterations per solver iteration, at most
+    solver_iterations: Annotated[int, Limits(1, 10_000)] = 4  # constraint solver iterations, at most
+    # line-search iterations per solver iteration, at most
+    line_search_iterations: Annotated[int, Limits(1, 10_000)] = 8
 
     @property
     def env_step_s(self) -> float:
@@ -53,8 +35,8 @@ class PhysicsConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    hidden_size: int = 128  # width of each LSTM layer and of each value layer
-    initial_log_std: float = 0.0  # log of the exploration standard deviation at the start
+    hidden_size: Annotated[int, Limits(1, 8192)] = 128  # width of each LSTM layer and of each value layer
+    initial_log_std: Annotated[float, Limits(-10, 3)] = 0.0  # log of the exploration standard deviation at the start
     learn_std: bool = True  # train the standard deviation; otherwise it stays at its start
     normalize_observations: bool = True  # running mean and variance, part of the checkpoint
     symmetric: bool = False  # mirror-equivariant policy and mirror-invariant value by construction
@@ -67,14 +49,18 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    num_workers: int = field(default_factory=available_cores)  # worker processes; the default is one per core
-    envs_per_worker: int = 0  # environments stepped together by one worker; 0 takes what the iteration fills, to 128
-    env_steps_per_iteration: int = 16384  # environment steps per iteration, all workers together
+    # worker processes; the default is one per core
+    num_workers: Annotated[int, Limits(1, 4096)] = field(default_factory=available_cores)
+    # environments stepped together by one worker; 0 takes what the iteration fills, to 128
+    envs_per_worker: Annotated[int, Limits(0, 65536)] = 0
+    # environment steps per iteration, all workers together
+    env_steps_per_iteration: Annotated[int, Limits(1, 10**9)] = 16384
     mode: Literal["unrolls", "episodes"] = "unrolls"  # fixed-length pieces, or whole episodes from a fresh reset
-    unroll_length: int = 64  # environment steps per trajectory in `unrolls` mode
-    max_episode_steps: int = 400  # time limit of an episode, environment steps
-    worker_start_timeout_s: float = 60.0  # a worker must report ready within this time
-    worker_timeout_s: float = 20.0  # a worker silent for this long while collecting is replaced
+    unroll_length: Annotated[int, Limits(1, 10**6)] = 64  # environment steps per trajectory in `unrolls` mode
+    max_episode_steps: Annotated[int, Limits(1, 10**6)] = 400  # time limit of an episode, environment steps
+    worker_start_timeout_s: Annotated[float, Limits(1, 86400)] = 60.0  # a worker must report ready within this time
+    # a worker silent for this long while collecting is replaced
+    worker_timeout_s: Annotated[float, Limits(1, 86400)] = 20.0
 
 
 @dataclass(frozen=True)
@@ -85,70 +71,89 @@ class RayConfig:
 @dataclass(frozen=True)
 class DistributedConfig:
     coordinator: str = ""  # HOST:PORT that process 0 listens on; empty when one process trains alone
-    num_processes: int = 1  # training processes that share one learner, usually one per host
-    process_id: int = 0  # of this process, from 0; process 0 writes the run directory
-    start_timeout_s: float = 120.0  # all processes must have joined within this time
+    # training processes that share one learner, usually one per host
+    num_processes: Annotated[int, Limits(1, 4096)] = 1
+    process_id: Annotated[int, Limits(0, 4095)] = 0  # of this process, from 0; process 0 writes the run directory
+    start_timeout_s: Annotated[float, Limits(1, 86400)] = 120.0  # all processes must have joined within this time
 
 
 @dataclass(frozen=True)
 class MjxConfig:
-    num_envs: int = 2048  # environments over all devices, a multiple of their number
+    num_envs: Annotated[int, Limits(1, 10**6)] = 2048  # environments over all devices, a multiple of their number
     impl: Literal["jax", "warp"] = "jax"  # any device, or MuJoCo Warp on NVIDIA
-    contacts_per_env: int = 16  # Warp: room for contacts, shared by a device's environments, per environment
-    constraints_per_env: int = 64  # Warp: most constraint rows of one environment
+    # Warp: room for contacts, shared by a device's environments, per environment
+    contacts_per_env: Annotated[int, Limits(1, 10_000)] = 16
+    constraints_per_env: Annotated[int, Limits(1, 10_000)] = 64  # Warp: most constraint rows of one environment
 
 
 @dataclass(frozen=True)
 class PPOConfig:
-    epochs: int = 5  # passes over the data of an iteration
-    minibatch_trajectories: int = 64  # trajectories per minibatch
-    policy_learning_rate: float = 3e-4  # Adam step size of the policy
-    value_learning_rate: float = 1e-3  # Adam step size of the value network
+    epochs: Annotated[int, Limits(1, 1000)] = 5  # passes over the data of an iteration
+    minibatch_trajectories: Annotated[int, Limits(1, 10**6)] = 64  # trajectories per minibatch
+    policy_learning_rate: Annotated[float, Limits(1e-12, 1)] = 3e-4  # Adam step size of the policy
+    value_learning_rate: Annotated[float, Limits(1e-12, 1)] = 1e-3  # Adam step size of the value network
     learning_rate_schedule: Literal["constant", "linear"] = "constant"  # linear goes to zero at total_env_steps
-    adam_epsilon: float = 1e-5  # Adam epsilon
-    max_gradient_norm: float = 0.5  # global-norm clip, each network on its own
-    clip: float = 0.2  # epsilon of the clipped surrogate
-    entropy_coefficient: float = 0.0  # c1
-    value_coefficient: float = 1.0  # c2
-    discount: float = 0.97  # gamma
+    adam_epsilon: Annotated[float, Limits(1e-16, 1)] = 1e-5  # Adam epsilon
+    max_gradient_norm: Annotated[float, Limits(1e-6, 1e9)] = 0.5  # global-norm clip, each network on its own
+    clip: Annotated[float, Limits(0.001, 0.999)] = 0.2  # epsilon of the clipped surrogate
+    entropy_coefficient: Annotated[float, Limits(0, 1e3)] = 0.0  # c1
+    value_coefficient: Annotated[float, Limits(1e-6, 1e6)] = 1.0  # c2
+    discount: Share = 0.97  # gamma
     advantage: Literal["gae", "return"] = "gae"  # GAE, or discounted return minus value (paper Eq. 2)
-    gae_lambda: float = 0.95  # lambda of GAE
+    gae_lambda: Share = 0.95  # lambda of GAE
     standardize_advantages: bool = True  # zero mean, unit deviation over the iteration
-    max_kl: float = 0.03  # skip the rest of the policy updates of an iteration beyond this KL; 0 never skips
+    # skip the rest of the policy updates of an iteration beyond this KL; 0 never skips
+    max_kl: Annotated[float, Limits(0, 1e6)] = 0.03
     mask_padding: bool = True  # False copies the published losses, which average over padding
 
 
 @dataclass(frozen=True)
 class DecoupledConfig:
-    max_lag: int = 4  # versions; trajectories of older parameters are dropped
-    replay_ratio: float = 1.0  # updates a trajectory may enter on average; above 1, the newest ones again while waiting
-    max_importance: float = 2.0  # importance weights of stale steps are cut off here
+    max_lag: Annotated[int, Limits(0, 10**6)] = 4  # versions; trajectories of older parameters are dropped
+    # updates a trajectory may enter on average; above 1, the newest ones again while waiting
+    replay_ratio: Annotated[float, Limits(1, 100)] = 1.0
+    max_importance: Annotated[float, Limits(1, 1e6)] = 2.0  # importance weights of stale steps are cut off here
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    every_iterations: int = 20  # evaluate the mean action every this many iterations; 0 never
-    episodes: int = 16  # episodes per evaluation
+    # evaluate the mean action every this many iterations; 0 never
+    every_iterations: Annotated[int, Limits(0, 10**9)] = 20
+    episodes: Annotated[int, Limits(1, 10**5)] = 16  # episodes per evaluation
 
 
 @dataclass(frozen=True)
 class CheckpointConfig:
-    every_iterations: int = 20  # save every this many iterations (and always at the end)
-    keep: int = 3  # newest checkpoints kept
+    every_iterations: Annotated[int, Limits(0, 10**9)] = 20  # save every this many iterations (and always at the end)
+    keep: Annotated[int, Limits(1, 10**6)] = 3  # newest checkpoints kept
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """A change of settings on the way, see `config/curriculum.py`."""
+
+    # the stage begins when the run has collected so many environment steps
+    at_env_steps: Annotated[int, Limits(1, 10**15)] = 1
+    set: dict[str, Any] = field(default_factory=dict)  # dotted field -> value, in force from then on
+    # metric -> its least mean over the last iterations; the stage also waits for all of them
+    wait_for: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Config:
-    task: Literal["cassie", "cartpole"] = "cassie"  # which task definition
+    """A run. Made by `convert.from_dict`, which adds the group of settings that the task has."""
+
+    section: ClassVar[str] = ""  # name of that group; empty where the task has none
+
+    task: str = "cassie"  # a task by name, or MODULE:NAME of a `config.tasks.TaskSpec`
     backend: Literal["cpu_pool", "ray", "mjx"] = "cpu_pool"  # CPU processes, Ray actors, or the accelerator
     schedule: Literal["sync", "overlap", "decoupled"] = "sync"  # collect, then train; collect one ahead; independently
-    seed: int = 0  # seeds every random stream
-    total_env_steps: int = 50_000_000  # training ends after this many environment steps
-    stages: tuple[str, ...] = ()  # settings that change on the way, "STEPS FIELD=VALUE ..."; see curriculum.py
+    seed: Annotated[int, Limits(0, 2**63 - 1)] = 0  # seeds every random stream
+    total_env_steps: Annotated[int, Limits(1, 10**15)] = 50_000_000  # training ends after this many environment steps
+    stages: tuple[StageConfig, ...] = ()  # settings that change on the way
     compilation_cache: bool = True  # keep compiled programs in the user's cache directory
     run_dir: str = ""  # where the run is written; empty makes runs/<task>-<time>
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    cassie: CassieConfig = field(default_factory=CassieConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
     ray: RayConfig = field(default_factory=RayConfig)
@@ -157,105 +162,15 @@ class Config:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     decoupled: DecoupledConfig = field(default_factory=DecoupledConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
-    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)  # stays the last: it shows a file is whole
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
+    @property
+    def settings(self) -> Any:
+        """The task's own settings; None where it has none."""
+        return getattr(self, self.section) if self.section else None
 
-def to_dict(config: Any) -> dict[str, Any]:
-    """The configuration as plain dicts, lists and scalars, ready for YAML or JSON."""
-    return {
-        f.name: to_dict(value)
-        if dataclasses.is_dataclass(value)
-        else list(value)
-        if isinstance(value, tuple)
-        else value
-        for f in dataclasses.fields(config)
-        for value in [getattr(config, f.name)]
-    }
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Its class is made for the task, so pickle cannot find it by name.
+        from hasrl_jax.config import convert
 
-
-def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
-    """`base` (default: `Config()`) with the fields named in `values` replaced.
-
-    Raises:
-      ConfigError: an unknown key or a value of another type; the message names the dotted path.
-    """
-    base = Config() if base is None else base
-    if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected a mapping of fields, got {shown(values)}")
-    hints = typing.get_type_hints(type(base))
-    changes = {}
-    for key, value in values.items():
-        path = f"{where}.{key}"
-        if key not in hints:
-            raise ConfigError(f"{path}: unknown field; known fields are {', '.join(hints)}")
-        current = getattr(base, key)
-        changes[key] = (
-            from_dict(value, current, path) if dataclasses.is_dataclass(current) else _convert(value, hints[key], path)
-        )
-    return dataclasses.replace(base, **changes)
-
-
-def _convert(value: Any, hint: Any, path: str) -> Any:
-    """`value` as the annotated type `hint`, or a ConfigError naming `path`."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value in args:
-            return value
-        raise ConfigError(f"{path}: got {shown(value)}; expected one of {', '.join(map(repr, args))}")
-    if origin is tuple and args[-1] is Ellipsis:
-        if isinstance(value, list | tuple):
-            return tuple(_convert(v, args[0], f"{path}[{i}]") for i, v in enumerate(value))
-        raise ConfigError(f"{path}: got {shown(value)}; expected a list")
-    if origin is tuple:
-        if isinstance(value, list | tuple) and len(value) == len(args):
-            return tuple(_convert(v, a, f"{path}[{i}]") for i, (v, a) in enumerate(zip(value, args, strict=True)))
-        raise ConfigError(f"{path}: got {shown(value)}; expected a list of {len(args)} numbers")
-    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
-        with contextlib.suppress(ValueError):
-            value = float(value)
-    accepted: Any = {float: (int, float), int: int, bool: bool, str: str}[hint]
-    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{path}: got {shown(value)}; expected {hint.__name__}")
-    try:
-        finite = math.isfinite(value) if hint is float else True
-    except OverflowError:  # an integer beyond the largest float
-        finite = False
-    if not finite:
-        raise ConfigError(f"{path}: got {shown(value)}; expected a finite number")
-    return hint(value)
-
-
-def shown(value: Any) -> str:
-    """`value` as an error message shows it: on one line, and short."""
-    try:
-        text = repr(value)
-    except ValueError:  # Python refuses to write integers of thousands of digits
-        return "a number of thousands of digits"
-    return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
-
-
-def load_yaml(path: str | Path) -> Config:
-    """Reads a YAML file over the defaults.
-
-    Raises:
-      ConfigError: missing or unreadable file, invalid YAML, a key given twice, unknown fields or wrong types.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--config {path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    try:
-        values = strict_yaml.parse(text)
-    except ValueError as error:
-        raise ConfigError(f"--config {path}: {error}") from None
-    return from_dict({} if values is None else values, where=Path(path).name)
-
-
-def shipped(name: str) -> Config:
-    """The configuration of `configs/<name>.yaml`."""
-    return load_yaml(CONFIG_FOLDER / f"{name}.yaml")
-
-
-def dump_yaml(config: Config) -> str:
-    """The resolved configuration as YAML text."""
-    return yaml.safe_dump(to_dict(config), sort_keys=False)
+        return convert.from_dict, (convert.to_dict(self),)

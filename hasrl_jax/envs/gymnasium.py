@@ -11,14 +11,15 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from hasrl_jax.config import limits as config_checks
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import recipe
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
-from hasrl_jax.envs.registry import RECIPES, TASKS, make_task
+from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import ConfigError
 
@@ -29,17 +30,14 @@ def make(task: str = "cassie", config: Config | None = None, **arguments: Any) -
     """A registered task as a gymnasium environment.
 
     Args:
-      task: a name from `registry.TASKS`; takes the place of `config.task`.
-      config: default: the task's training configuration, `registry.RECIPES`.
+      task: its name, see `config.tasks.find`; takes the place of `config.task`.
+      config: default: the one that trains the task, `config.files.recipe`.
       **arguments: further arguments of `TaskEnv`.
 
     Raises:
       ConfigError: an unknown task or impossible configuration values.
     """
-    if task not in TASKS:
-        raise ConfigError(f"task: got {task!r}; expected one of {', '.join(TASKS)}")
-    base = config_module.shipped(RECIPES[task]) if config is None else config
-    return TaskEnv(config_module.from_dict({"task": task}, base), **arguments)
+    return TaskEnv(recipe(task) if config is None else from_dict({"task": task}, config), **arguments)
 
 
 def fixed_command(config: Config, forward: float | None = None, lateral: float | None = None) -> Config:
@@ -53,12 +51,7 @@ def fixed_command(config: Config, forward: float | None = None, lateral: float |
         command["lateral_m_s"] = [lateral, lateral]
     if forward is not None and lateral is not None:
         command["resample_s"] = [0.0, 0.0]
-    return config_module.from_dict({"cassie": {"command": command}}, config)
-
-
-def undisturbed(config: Config) -> Config:
-    """`config` with the nominal robot and no pushes but those that are asked for."""
-    return config_module.from_dict({"cassie": {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}}, config)
+    return from_dict({"cassie": {"command": command}}, config)
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -90,8 +83,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         camera: str = "track",
         shadow_px: int | None = None,
     ):
-        self.config = config_module.shipped("cassie_walk") if config is None else config
-        config_checks.check(self.config)
+        self.config = recipe("cassie") if config is None else config
+        check(self.config)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode: got {render_mode!r}; expected None or 'rgb_array'")
         self.render_mode = render_mode
@@ -250,7 +243,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if command.shape != (2,) or not np.isfinite(command).all():
             raise ConfigError(f"command: got {speeds!r}; expected two finite speeds in m/s")
         config = fixed_command(self.config, *command.tolist())
-        config_checks.check(config)
+        check(config)
         return config
 
     def _make_renderer(self) -> mujoco.Renderer:

@@ -10,8 +10,10 @@ import numpy as np
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
+from hasrl_jax.config.checks import limits_of
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.limits import check_number
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.schema import Config, EvaluateConfig
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
@@ -232,8 +234,8 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "--against", nargs="*", default=[], help='more policies for the scorecard: "zero", "random", run directories'
     )
     known, rest = parser.parse_known_args(arguments)
-    check_number("--episodes", "evaluate.episodes", known.episodes)
-    check_number("--seed", "seed", known.seed)
+    check_number("--episodes", known.episodes, limits_of(EvaluateConfig, "episodes"))
+    check_number("--seed", known.seed, limits_of(Config, "seed"))
     if known.seconds is None:
         known.seconds = 60.0 if known.scorecard else 20.0
     if not 0 < known.seconds <= MAX_SECONDS:

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax.collect.supervisor import ONE_THREAD
-from hasrl_jax.config.schema import Config, available_cores, from_dict, to_dict
+from hasrl_jax.config.convert import from_dict, to_dict
+from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 
 from hasrl_jax.config.schema import PPOConfig
 from hasrl_jax.learn import distributions, networks, returns
-from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS
 from hasrl_jax.learn.networks import Parameters, Policy, Value
-from hasrl_jax.types import Trajectory
+from hasrl_jax.types import SEGMENT_FIELDS, Trajectory
 
 Metrics = dict[str, jax.Array]
 
@@ -45,7 +44,7 @@ def prepare_batch(trajectory: Trajectory, ppo: PPOConfig) -> tuple[Batch, Metric
         valid = mask.reshape(mask.shape + (1,) * (field.ndim - 2))
         return jnp.where(valid, field, jnp.zeros_like(field))
 
-    per_step = {name: blank(field) for name, field in trajectory._asdict().items() if name not in PER_TRAJECTORY_FIELDS}
+    per_step = {name: blank(field) for name, field in trajectory._asdict().items() if name not in SEGMENT_FIELDS}
     steps = trajectory._replace(**per_step)
     advantage, target = returns.advantage_and_target(
         steps.reward,

@@ -108,8 +108,8 @@ def init_learner(
     return jax.jit(create)(key)  # one program starts sooner than its operations one by one
 
 
-def export_parameters(state: LearnerState, normalize_observations: bool = True) -> dict[str, np.ndarray]:
-    """What a collector needs to act, as float32 NumPy arrays that it owns.
+def acting_parameters(state: LearnerState, normalize_observations: bool = True) -> dict[str, jax.Array]:
+    """What a collector needs to act, where the learner keeps it.
 
     Names: "policy/<name>" and "value/<name>" with the parameter names of `Policy` and `Value`, and, when observations
     are normalised, "normalizer/mean" and "normalizer/std" [O].
@@ -121,7 +121,13 @@ def export_parameters(state: LearnerState, normalize_observations: bool = True) 
     flat |= {f"value/{name}": array for name, array in state.value_params.items()}
     if mean is not None and std is not None:
         flat |= {"normalizer/mean": mean, "normalizer/std": std}
-    return {name: np.array(array, np.float32) for name, array in jax.device_get(flat).items()}
+    return flat
+
+
+def export_parameters(state: LearnerState, normalize_observations: bool = True) -> dict[str, np.ndarray]:
+    """`acting_parameters` as float32 NumPy arrays that the caller owns."""
+    parameters = jax.device_get(acting_parameters(state, normalize_observations))
+    return {name: np.array(array, np.float32) for name, array in parameters.items()}
 
 
 class Update:

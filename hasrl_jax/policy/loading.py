@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hasrl_jax.config import limits as config_checks
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.compat import upgraded
+from hasrl_jax.config.convert import from_dict, to_dict
+from hasrl_jax.config.files import shipped
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import CheckpointError, ConfigError
@@ -69,7 +71,7 @@ def with_physics(config: Config, physics: str) -> Config:
     """`config` with the walking task at the "paper" 2 kHz physics; for "training", or another task, as it is."""
     if physics == "training" or config.task != "cassie":
         return config
-    return config_module.from_dict({"physics": config_module.to_dict(config_module.shipped("paper").physics)}, config)
+    return from_dict({"physics": to_dict(shipped("paper").physics)}, config)
 
 
 def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
@@ -108,7 +110,7 @@ def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]
 
 def policy_metadata(config: Config) -> dict[str, object]:
     """What a released policy file must carry besides its parameters."""
-    return {"config": config_module.to_dict(config)}
+    return {"config": to_dict(config)}
 
 
 def _from_source(source: str) -> tuple[Config, dict[str, np.ndarray]]:
@@ -127,8 +129,8 @@ def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
 def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
     parameters, metadata = checkpoint.load_policy(path)
     try:
-        config = config_module.from_dict(metadata["config"])
-        config_checks.check(config)
+        config = from_dict(upgraded(metadata["config"]))
+        check(config)
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: its configuration cannot be read: {error}") from None
     task = make_task(config)

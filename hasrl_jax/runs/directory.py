@@ -13,9 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from hasrl_jax.config import limits as config_checks
-from hasrl_jax.config import schema as config_module
 from hasrl_jax.config import strict_yaml
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.compat import upgraded
+from hasrl_jax.config.convert import LAST, from_dict
+from hasrl_jax.config.files import dump_yaml
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, RunError
 
@@ -84,14 +86,13 @@ def load_run_config(run_dir: Path) -> Config:
         raise RunError(f"{path}: cannot be read: {_reason(error)}") from None
     # A file that was cut short is often still valid YAML; defaults must not quietly take the place of what is missing.
     # Only the last group tells: others may be younger than the run.
-    last = dataclasses.fields(Config)[-1].name
-    missing = not isinstance(values, dict) or last not in values
+    missing = not isinstance(values, dict) or LAST not in values
     if missing or not text.endswith("\n"):
-        cut = f"{last} is missing" if missing else "the last line is cut short"
+        cut = f"{LAST} is missing" if missing else "the last line is cut short"
         raise RunError(f"{path}: damaged, or written by another version: {cut}")
     try:
-        config = config_module.from_dict(values, where=CONFIG_FILE)
-        config_checks.check(config)
+        config: Config = from_dict(upgraded(values), where=CONFIG_FILE)
+        check(config)
     except ConfigError as error:
         raise RunError(f"{path}: damaged, or written by another version: {error}") from None
     return config
@@ -161,7 +162,7 @@ def write_config(run_dir: Path, config: Config) -> None:
     path = run_dir / CONFIG_FILE
     partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(config_module.dump_yaml(config), encoding="utf-8")
+        partial.write_text(dump_yaml(config), encoding="utf-8")
         partial.replace(path)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {_reason(error)}") from None

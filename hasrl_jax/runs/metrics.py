@@ -20,7 +20,7 @@ from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttr
 from hasrl_jax.errors import RunError
 from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY
 
-_COLLECT_METRICS = ("env_steps", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
+_COLLECT_METRICS = ("env_steps", "stage", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
 _RATE_WINDOW = 20  # iterations over which the speed behind "time left" is measured
 
 
@@ -94,14 +94,15 @@ class MetricsWriter:
 
 
 def tag(name: str) -> str:
-    """The TensorBoard tag of a metric: grouped as train/, test/, time/, collect/, reward/ and learner/."""
+    """The TensorBoard tag of a metric: grouped as train/, eval/, time/, collect/, reward/ and learner/."""
     if "/" in name:
         return name
     if name.endswith(("_seconds", "_per_second")):
         return f"time/{name}"
-    for group in ("train", "test"):
-        if name.endswith(f"_{group}"):
-            return f"{group}/{name.removesuffix(f'_{group}')}"
+    if name.endswith("_train"):
+        return f"train/{name.removesuffix('_train')}"
+    if name.startswith("eval_"):
+        return f"eval/{name.removeprefix('eval_')}"
     return f"collect/{name}" if name in _COLLECT_METRICS or name.startswith("policy_lag") else f"learner/{name}"
 
 
@@ -156,10 +157,10 @@ class ProgressPrinter:
         return max(0, self._total - last_steps) * (last_time - first_time) / (last_steps - first_steps)
 
 
-class Silent:
+class NullLogger:
     """Takes the place of the writer and of the printer where another process reports."""
 
-    def __enter__(self) -> "Silent":
+    def __enter__(self) -> "NullLogger":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -185,8 +186,8 @@ def progress_line(record: Mapping[str, float | int | None]) -> str:
         f"{show('env_steps_per_second', ',.0f')}/s",
         f"train return {show('episode_return_train', '.1f')} length {show('episode_length_train', '.0f')}",
     ]
-    if record.get("episode_return_test") is not None:
-        parts.append(f"test return {show('episode_return_test', '.1f')} length {show('episode_length_test', '.0f')}")
+    if record.get("eval_return") is not None:
+        parts.append(f"eval return {show('eval_return', '.1f')} length {show('eval_length', '.0f')}")
     parts.append(f"KL {show('approx_kl', '.4f')} entropy {show('entropy', '.2f')}")
     return " | ".join(parts)
 

@@ -22,10 +22,12 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hasrl_jax.collect.collectors import Collector, Experience
-from hasrl_jax.config.schema import Config, DistributedConfig, shown, to_dict
+from hasrl_jax.collect.protocol import Collector, Experience, Parameters
+from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.limits import shown
+from hasrl_jax.config.schema import Config, DistributedConfig
+from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import ConfigError, WorkerError
-from hasrl_jax.learn import ppo
 from hasrl_jax.types import Record, Trajectory
 
 log = logging.getLogger("hasrl_jax")
@@ -145,6 +147,11 @@ def any_process(config: Config, condition: bool) -> bool:
     return any(exchange(condition)) if config.distributed.num_processes > 1 else condition
 
 
+def first_process(config: Config, condition: bool) -> bool:
+    """Whether the condition holds in the first process; all must ask."""
+    return exchange(condition)[0] if config.distributed.num_processes > 1 else condition
+
+
 def exchange(value: Any) -> list[Any]:
     """What each process calls this with, in their order; anything that JSON can hold. All must call it.
 
@@ -208,8 +215,8 @@ class SharedExperience:
     def busy(self) -> bool:
         return self.own.busy
 
-    def start(self, learner: ppo.LearnerState, iteration: int, version: int) -> None:
-        self.own.start(learner, iteration, version)
+    def start(self, parameters: Parameters, iteration: int, version: int) -> None:
+        self.own.start(parameters, iteration, version)
 
     def finish(self) -> Experience:
         """Waits for the workers of all processes."""
@@ -217,6 +224,9 @@ class SharedExperience:
         rows, env_steps, records = zip(*exchange([len(own.trajectory.mask), own.env_steps, own.record]), strict=True)
         trajectory = to_global(own.trajectory, max(rows), self.mesh)
         return Experience(trajectory, sum(env_steps), merge_records(list(records)))
+
+    def configure(self, config: Config, task: Task) -> None:
+        self.own.configure(config, task)
 
     def save(self) -> list[bytes]:
         own = [base64.b64encode(state).decode() for state in self.own.save()]

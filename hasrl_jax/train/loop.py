@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.collect.collectors import Collector, Experience, make_collector, prepare_jax
+from hasrl_jax.collect.backends import make_collector
+from hasrl_jax.collect.protocol import Collector, Experience, Networks
 from hasrl_jax.config import curriculum
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
@@ -21,15 +22,17 @@ from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import DivergenceError, LearnerError, WorkerError
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.learn import ppo
+from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.directory import RunDirectory, open_run, write_config
-from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, Silent
+from hasrl_jax.runs.metrics import MetricsWriter, NullLogger, ProgressPrinter
 from hasrl_jax.train import distributed
+from hasrl_jax.train.devices import prepare_jax
 from hasrl_jax.types import Mirror, Record
 
 log = logging.getLogger("hasrl_jax")
-TEST_SEED = 1_000_003  # apart from every training stream
+EVALUATION_SEED = 1_000_003  # apart from every training stream
 
 
 class Progress(NamedTuple):
@@ -38,6 +41,8 @@ class Progress(NamedTuple):
     iteration: int = 0  # iterations finished, which is also the version of the parameters
     env_steps: int = 0  # environment steps collected
     seconds: float = 0.0  # spent training
+    stage: int = 0  # stages that have begun
+    history: dict[str, list[float]] = {}  # noqa: RUF012 (of metrics that stages wait for; never changed in place)
 
 
 class RunState(NamedTuple):
@@ -49,13 +54,11 @@ class RunState(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A stage of the run with all that works on it."""
+    """The run between two stages."""
 
     config: Config
-    until_env_steps: int
     task: Task
     update: ppo.Update
-    collector: Collector
 
 
 def train(
@@ -75,7 +78,7 @@ def train(
     prepare_jax(config)
     distributed.join(config)
     reports = config.distributed.process_id == 0
-    parts = [prepare(stage, make_update) for stage in curriculum.stages(config)]  # also refuses what cannot work
+    parts = make_parts(config, make_update)  # also refuses what cannot work
     learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
     if init_policy:
         learner = policies.with_parameters(learner, policies.load_initial(config, init_policy))
@@ -83,92 +86,129 @@ def train(
     with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
         if resume:
             loaded = checkpoint.load(run.checkpoints, learner)
-            state = RunState(loaded.learner, Progress(**loaded.extra), loaded.blobs)
+            state = RunState(loaded.learner, progress_from(loaded.extra, config), loaded.blobs)
             if reports:
                 write_config(run.path, config)  # some settings may differ from now on
         else:
             save(config, run.checkpoints, state)  # whatever happens now, --resume has a beginning
         with (
-            MetricsWriter(run.path, state.progress.iteration) if reports else Silent() as writer,
-            ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else Silent() as printer,
+            MetricsWriter(run.path, state.progress.iteration) if reports else NullLogger() as writer,
+            ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else NullLogger() as printer,
         ):
-            for part in parts:
-                stopped = distributed.any_process(config, bool(stop))
-                if state.progress.env_steps < part.until_env_steps and not stopped:
-                    state = train_part(part, state, run, stop, [writer.write, printer.update])
+            state = run_iterations(parts, state, run, stop, [writer.write, printer.update])
     progress = state.progress
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
 
 
-def prepare(stage: curriculum.Stage, make_update: Callable[..., ppo.Update]) -> Part:
-    """Makes what a stage needs; nothing starts or compiles yet.
+def make_parts(config: Config, make_update: Callable[..., ppo.Update]) -> list[Part]:
+    """What each part of the run needs; nothing starts or compiles yet.
+
+    Parts whose learner has the same settings share one update, and so one compiled program.
 
     Raises:
       ConfigError: the settings do not fit together, or this machine.
     """
-    config, until = stage
-    task, mesh = make_task(config), ppo.make_mesh()
-    collector = make_collector(config, task, mesh)
+    mesh, parts = ppo.make_mesh(), list[Part]()
+    for part_config in curriculum.resolve(config):
+        task = make_task(part_config)
+        shares_update = parts and parts[-1].config.ppo == part_config.ppo  # stages change nothing else that it reads
+        update = parts[-1].update if shares_update else make_update(part_config, *sizes(task), mesh)
+        parts.append(Part(part_config, task, update))
+    return parts
+
+
+def connect(part: Part) -> Collector:
+    """The collector of a run that begins or goes on with `part`.
+
+    Raises:
+      ConfigError: the settings do not fit together, or this machine.
+    """
+    config, task, update = part
+    networks = Networks(*make_networks(config.network, *sizes(task)))
+    collector = make_collector(config, task, update.mesh, networks)
     if config.distributed.num_processes > 1:
-        collector = distributed.SharedExperience(config, collector, mesh)
-    return Part(config, until, task, make_update(config, *sizes(task), mesh), collector)
+        return distributed.SharedExperience(config, collector, update.mesh)
+    return collector
 
 
-def train_part(
-    part: Part, state: RunState, run: RunDirectory, stop: "Stop", report: list[Callable[[Record], None]]
+def progress_from(extra: dict[str, Any], config: Config) -> Progress:
+    """Where a checkpoint says that the run stands; those of version 0.1 do not name the stage."""
+    begun = sum(stage.at_env_steps <= extra["env_steps"] for stage in config.stages)
+    return Progress(**{"stage": begun} | extra)
+
+
+def run_iterations(
+    parts: list[Part], state: RunState, run: RunDirectory, stop: "Stop", report: list[Callable[[Record], None]]
 ) -> RunState:
-    """Collects and learns under one configuration until its stage ends or `stop` is true; returns what it saved.
+    """Collects and learns until the run ends or `stop` is true; returns what it saved.
 
     Args:
-      part: from `prepare`.
+      parts: from `make_parts`.
       state: where the run stands.
       run: takes the checkpoints.
       stop: asked after every iteration.
       report: given the metrics of every iteration.
     """
-    config, until, task, update, collector = part
     learner, progress, env_states = state
-    reports = config.distributed.process_id == 0
-    with collector:
-        announce(part, run.path, progress)
+    stages = curriculum.Stages(parts[0].config.stages, progress.stage, progress.history)
+    collecting = stages.current  # the part whose settings the collector has
+    with connect(parts[collecting]) as collector:
+        announce(parts[collecting], collector, run.path, progress)
         collector.load(list(env_states))
-        while progress.env_steps < until and not distributed.any_process(config, bool(stop)):
-            started = time.monotonic()
+        while not ended(parts[0].config, progress) and not distributed.any_process(parts[0].config, bool(stop)):
+            part = parts[stages.current]
+            config, started = part.config, time.monotonic()
             if not collector.busy:
-                collector.start(learner, progress.iteration, version=progress.iteration)
+                if collecting != stages.current:
+                    collector.configure(config, part.task)
+                    collecting = stages.current
+                collector.start(acting_parameters(config, learner), progress.iteration, version=progress.iteration)
             try:
                 experience = collector.finish()
             except WorkerError:
                 save(config, run.checkpoints, RunState(learner, progress))
                 raise
-            env_steps = progress.env_steps + experience.env_steps
-            if config.schedule == "overlap" and env_steps < until and not stop:
-                collector.start(learner, progress.iteration + 1, version=progress.iteration)
+            progress = progress._replace(env_steps=progress.env_steps + experience.env_steps)
+            goes_on = not ended(config, progress) and not stop and not stages.due(progress.env_steps)
+            if config.schedule == "overlap" and goes_on and collecting == stages.current:
+                collector.start(acting_parameters(config, learner), progress.iteration + 1, version=progress.iteration)
 
             update_started = time.monotonic()
-            learner, metrics = learn(update, learner, experience, progress.iteration + 1)
+            learner, metrics = learn(part.update, learner, experience, progress.iteration + 1)
             now = time.monotonic()
-            progress = Progress(progress.iteration + 1, env_steps, progress.seconds + now - started)
+            seconds = progress.seconds + now - started
+            progress = progress._replace(iteration=progress.iteration + 1, seconds=seconds)
             record: Record = {
-                **{"iteration": progress.iteration, "env_steps": env_steps, "train_seconds": progress.seconds},
-                **experience.record,
-                **metrics,
+                **{"iteration": progress.iteration, "env_steps": progress.env_steps, "train_seconds": seconds},
+                **{"stage": progress.stage, **experience.record, **metrics},
                 "env_steps_per_second": experience.env_steps / (now - started),
                 "wait_seconds": update_started - started,
                 "update_seconds": now - update_started,
             }
-
-            last = env_steps >= config.total_env_steps
-            if reports and (due(progress.iteration, config.evaluate.every_iterations) or last):
-                record |= test_record(config, task, learner)
+            due_for_evaluation = due(progress.iteration, config.evaluate.every_iterations)
+            if config.distributed.process_id == 0 and (due_for_evaluation or ended(config, progress)):
+                record |= evaluation_record(config, part.task, learner)
             for give in report:
                 give(record)
+            if distributed.first_process(config, stages.advance(progress.env_steps, record)):
+                log.info("stage %d begins at %s environment steps", stages.current, f"{progress.env_steps:,}")
+            progress = progress._replace(stage=stages.current, history=stages.history)
             if due(progress.iteration, config.checkpoint.every_iterations):
                 save(config, run.checkpoints, RunState(learner, progress, collector.save()))
         state = RunState(learner, progress, collector.save())
         if not due(progress.iteration, config.checkpoint.every_iterations):
             save(config, run.checkpoints, state)
     return state
+
+
+def ended(config: Config, progress: Progress) -> bool:
+    """Whether the run has collected all that it was to collect."""
+    return progress.env_steps >= config.total_env_steps
+
+
+def acting_parameters(config: Config, learner: ppo.LearnerState) -> dict[str, jax.Array]:
+    """What the collector acts with."""
+    return ppo.acting_parameters(learner, config.network.normalize_observations)
 
 
 def sizes(task: Task) -> tuple[int, int, Mirror | None]:
@@ -200,15 +240,15 @@ def learn(
     return learner, record
 
 
-def test_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:
+def evaluation_record(config: Config, task: Task, learner: ppo.LearnerState) -> Record:
     """Return and length of evaluation episodes with the mean action."""
     started = time.monotonic()
     parameters = ppo.export_parameters(learner, config.network.normalize_observations)
-    episodes = run_episodes(config, task, parameters, config.evaluate.episodes, seed=TEST_SEED)
+    episodes = run_episodes(config, task, parameters, config.evaluate.episodes, seed=EVALUATION_SEED)
     return {
-        "episode_return_test": float(episodes.episode_return.mean()),
-        "episode_length_test": float(episodes.episode_length.mean()),
-        "test_seconds": time.monotonic() - started,
+        "eval_return": float(episodes.episode_return.mean()),
+        "eval_length": float(episodes.episode_length.mean()),
+        "eval_seconds": time.monotonic() - started,
     }
 
 
@@ -225,9 +265,9 @@ def due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
 
 
-def announce(part: Part, run_dir: Path, progress: Progress) -> None:
-    """The first lines of a run or stage: what runs where, and how fast the physics is sampled."""
-    config, until, task, _, collector = part
+def announce(part: Part, collector: Collector, run_dir: Path, progress: Progress) -> None:
+    """The first lines of a run: what runs where, and how fast the physics is sampled."""
+    config, task, _ = part
     devices = ", ".join(str(device) for device in jax.devices())
     log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
     log.info(
@@ -237,8 +277,8 @@ def announce(part: Part, run_dir: Path, progress: Progress) -> None:
         1 / task.env_step_s,
     )
     after = f", continuing after iteration {progress.iteration}" if progress.iteration else ""
-    end = f", stage until {until:,} environment steps" if config.stages else ""
-    log.info("run directory %s%s%s", run_dir, after, end)
+    stage = f", stage {progress.stage} of {len(config.stages)}" if config.stages else ""
+    log.info("run directory %s%s%s", run_dir, after, stage)
 
 
 class Stop:

@@ -15,7 +15,8 @@ import numpy as np
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, require_writable
-from hasrl_jax.config.schema import Config, to_dict
+from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, RunError
 from hasrl_jax.runs.directory import METRICS_FILE, load_run_config
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+RENAMED = {"episode_return_test": "eval_return", "episode_length_test": "eval_length"}  # since version 0.1
 Series = dict[str, np.ndarray]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 SMOOTHED = 9  # iterations in the moving mean that is drawn over the raw values of fig4
@@ -45,6 +47,7 @@ def read_metrics(run_dir: Path) -> Series:
         raise RunError(f"{path}: damaged ({error})") from None
     if not records:
         raise RunError(f"{path}: holds no iteration yet")
+    records = [{RENAMED.get(name, name): value for name, value in record.items()} for record in records]
     names = {name for record in records for name, value in record.items() if isinstance(value, int | float | None)}
     return {name: np.array([_number(record.get(name)) for record in records]) for name in sorted(names)}
 
@@ -73,9 +76,9 @@ def fig3(runs: list[Series], names: list[str]) -> "Figure":
     figure, axes = _axes(3)
     run, x = runs[0], runs[0]["iteration"]
     axes[0].plot(x, run["episode_return_train"], color=COLOURS[0], linewidth=0.8, label="training")
-    if "episode_return_test" in run:
-        tested = np.isfinite(run["episode_return_test"])
-        axes[0].plot(x[tested], run["episode_return_test"][tested], color=COLOURS[1], linewidth=1, label="testing")
+    if "eval_return" in run:
+        evaluated = np.isfinite(run["eval_return"])
+        axes[0].plot(x[evaluated], run["eval_return"][evaluated], color=COLOURS[1], linewidth=1, label="evaluation")
     axes[0].legend(fontsize=7)
     _label(axes[0], "(a) episode return", "iteration")
     axes[1].plot(x, run["ratio_mean"], color=COLOURS[0], linewidth=0.8)

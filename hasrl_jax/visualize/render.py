@@ -201,11 +201,12 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
 
 def _config_to_film(config: "Config", known: argparse.Namespace) -> "Config":
     """The nominal robot, so that the film runs in real time, what was asked for and nothing else, and no time limit."""
-    from hasrl_jax.config.schema import from_dict
-    from hasrl_jax.envs.gymnasium import fixed_command, undisturbed
+    from hasrl_jax.config import tasks
+    from hasrl_jax.config.convert import from_dict
+    from hasrl_jax.envs.gymnasium import fixed_command
 
     cap = max(1, round(known.seconds / config.physics.env_step_s)) + 1
-    config = undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
+    config = tasks.find(config.task).undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
     return fixed_command(config, known.forward, known.lateral)
 
 
@@ -214,7 +215,10 @@ def _strip(known: argparse.Namespace) -> Path:
 
 
 def _check(known: argparse.Namespace) -> None:
+    from hasrl_jax.config.checks import limits_of
     from hasrl_jax.config.limits import check_number
+    from hasrl_jax.config.schema import Config
+    from hasrl_jax.envs.cassie.settings import CommandConfig
     from hasrl_jax.errors import ConfigError
 
     for name in ("width", "height"):
@@ -229,9 +233,9 @@ def _check(known: argparse.Namespace) -> None:
             raise ConfigError(f"--{name.replace('_', '-')}: got {value}; expected finite numbers")
     if not 0 < known.seconds <= 3600:
         raise ConfigError(f"--seconds: got {known.seconds:g}; expected more than 0 and at most 3600")
-    check_number("--seed", "seed", known.seed)
+    check_number("--seed", known.seed, limits_of(Config, "seed"))
     if known.speeds:
-        check_number("--speeds", "cassie.command.forward_m_s", (min(known.speeds), max(known.speeds)))
+        check_number("--speeds", (min(known.speeds), max(known.speeds)), limits_of(CommandConfig, "forward_m_s"))
     for name, path, suffix in (("--out", known.out, ".mp4"), ("--strip", _strip(known), ".png")):
         require_writable(name, path, suffix)  # fail now, and not after minutes of rendering
 

@@ -193,7 +193,7 @@ def test_workers_end_with_a_killed_parent(make_config):
         import time
         from hasrl_jax.collect.supervisor import CpuPool
         from hasrl_jax.collect.plan import make_plan
-        from hasrl_jax.config.schema import from_dict
+        from hasrl_jax.config.convert import from_dict
         from hasrl_jax.envs.registry import make_task
         config = from_dict({"task": "cartpole", "collect": {"num_workers": 2}})
         pool = CpuPool(config, make_plan(config), make_task(config))

@@ -11,7 +11,7 @@ import pytest
 from hasrl_jax.collect.decoupled import FreePool
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.collect.supervisor import MAX_FAILURES
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import WorkerError
 
@@ -25,7 +25,7 @@ def make_pool(make_config):
     def make(max_lag: int = 4, **collect) -> FreePool:
         sizes = {"num_workers": WORKERS, "env_steps_per_iteration": WORKERS * STEPS, "worker_timeout_s": 2.0}
         free = {"schedule": "decoupled", "decoupled": {"max_lag": max_lag}}
-        config = config_module.from_dict(free, make_config(**(sizes | collect)))
+        config = from_dict(free, make_config(**(sizes | collect)))
         pools.append(FreePool(config, make_plan(config), make_task(config)))
         return pools[-1]
 

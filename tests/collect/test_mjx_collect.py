@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from hasrl_jax.collect import shared_memory
-from hasrl_jax.collect.collectors import MjxExperience
-from hasrl_jax.collect.mjx import ActingParameters, CollectorState, MjxCollector, Statistics, make_mjx_plan
-from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config, from_dict, shipped
+from hasrl_jax.collect.mjx import ActingParameters, CollectorState, MjxCollector, MjxRollout, Statistics, make_mjx_plan
+from hasrl_jax.collect.protocol import Networks
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import shipped
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import StepResult
 from hasrl_jax.envs.mjx_engine import make_engine
 from hasrl_jax.envs.registry import make_task
@@ -28,7 +29,7 @@ from hasrl_jax.learn.ppo import make_mesh
 from hasrl_jax.types import Trajectory
 
 NUM_ENVS = 16
-CONFIG = config_module.from_dict(
+CONFIG = from_dict(
     {
         "task": "cartpole",
         "physics": {"timestep_s": 0.005},
@@ -52,15 +53,15 @@ def _fragile_task() -> Task:
     return dataclasses.replace(task, step=step)
 
 
-def _collector(num_devices: int) -> MjxCollector:
+def _collector(num_devices: int) -> MjxRollout:
     task = _fragile_task()
     networks = make_networks(CONFIG.network, task.observation_size, task.action_size, task.mirror)
     engine = make_engine(task, "jax", CONFIG.collect.max_episode_steps)
     mesh = make_mesh(jax.devices()[:num_devices])
-    return MjxCollector(make_mjx_plan(CONFIG, NUM_ENVS, num_devices), engine, *networks, mesh)
+    return MjxRollout(make_mjx_plan(CONFIG, NUM_ENVS, num_devices), engine, *networks, mesh)
 
 
-def _parameters(collector: MjxCollector) -> ActingParameters:
+def _parameters(collector: MjxRollout) -> ActingParameters:
     """Random parameters, far enough from zero that a mistake anywhere shows."""
     observation = jnp.zeros((1, collector.engine.task.observation_size))
     shapes = [network.init(jax.random.key(0), observation)["params"] for network in (collector.policy, collector.value)]
@@ -72,7 +73,7 @@ def _parameters(collector: MjxCollector) -> ActingParameters:
 class Run(SimpleNamespace):
     """Two iterations on eight devices: `states` before, between and after, `trajectories` and `statistics`."""
 
-    collector: MjxCollector
+    collector: MjxRollout
     parameters: ActingParameters
     states: list[CollectorState]
     trajectories: list[Trajectory]
@@ -302,9 +303,10 @@ def test_the_first_state_has_the_types_of_the_next() -> None:
     learner = ppo.init_learner(config, *sizes, jax.random.key(0))
     statistics = normalize.mean_std(learner.normalizer)
     parameters = ActingParameters(learner.policy_params, learner.value_params, *statistics)
-    with MjxExperience(config, task, mesh) as experience:
-        after = jax.eval_shape(experience.collector._jitted, parameters, experience.state, jnp.int32(0))[0]
-        before = jax.eval_shape(lambda state: state, experience.state)
+    networks = Networks(*make_networks(config.network, *sizes))
+    with MjxCollector(config, task, mesh, networks) as collector:
+        after = jax.eval_shape(collector.rollout._jitted, parameters, collector.state, jnp.int32(0))[0]
+        before = jax.eval_shape(lambda state: state, collector.state)
     assert [(x.dtype, x.weak_type) for x in jax.tree.leaves(before)] == [
         (x.dtype, x.weak_type) for x in jax.tree.leaves(after)
     ]

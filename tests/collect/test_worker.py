@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from hasrl_jax.collect import shared_memory
+from hasrl_jax.collect.buffer import pad_segments
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.collect.worker import Actor
 from hasrl_jax.learn import distributions
-from hasrl_jax.learn.batching import pad_segments
 from hasrl_jax.learn.networks import Policy, make_networks
 
 MODES = ("unrolls", "episodes")

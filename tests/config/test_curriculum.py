@@ -1,4 +1,4 @@
-"""The curriculum: what each stage sets, in what order, and what is refused."""
+"""The curriculum: what each stage sets, when it begins, and what is refused."""
 
 from pathlib import Path
 
@@ -6,56 +6,94 @@ import pytest
 
 from hasrl_jax.cli.parsing import parse_train
 from hasrl_jax.config import curriculum
-from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.schema import Config
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.curriculum import WINDOW, Stages
 from hasrl_jax.errors import ConfigError
 
-STAGES = ["1000 cassie.command.start_moving=0.6", "2e3 cassie.command.forward_m_s=[-0.3,1.0] ppo.clip=0.1"]
+STAGES = [
+    {"at_env_steps": 1000, "set": {"cassie.command.start_moving": 0.6}},
+    {"at_env_steps": 2000, "set": {"cassie.command.forward_m_s": [-0.3, 1.0], "ppo.clip": 0.1}},
+]
+WAITING = [{"at_env_steps": 1000, "wait_for": {"episode_length_train": 50.0}, "set": {"ppo.clip": 0.1}}, STAGES[1]]
 
 
 def test_settings_change_and_stay() -> None:
-    config = config_module.from_dict({"stages": STAGES, "total_env_steps": 5000})
-    first, second, third = curriculum.stages(config)
-    assert (first.until_env_steps, second.until_env_steps, third.until_env_steps) == (1000, 2000, 5000)
-    assert first.config == config
-    assert second.config.cassie.command.start_moving == third.config.cassie.command.start_moving == 0.6
-    assert second.config.ppo.clip == 0.2
-    assert third.config.cassie.command.forward_m_s == (-0.3, 1.0)
-    assert third.config.ppo.clip == 0.1
+    config = from_dict({"stages": STAGES, "total_env_steps": 5000})
+    first, second, third = curriculum.resolve(config)
+    assert first == config
+    assert second.settings.command.start_moving == third.settings.command.start_moving == 0.6
+    assert second.ppo.clip == 0.2
+    assert third.settings.command.forward_m_s == (-0.3, 1.0)
+    assert third.ppo.clip == 0.1
 
 
-def test_a_short_run_ends_within_its_stages() -> None:
-    config = config_module.from_dict({"stages": STAGES, "total_env_steps": 1500})
-    assert [stage.until_env_steps for stage in curriculum.stages(config)] == [1000, 1500, 1500]
+def test_a_stage_may_set_a_group_of_settings() -> None:
+    config = from_dict({"stages": [{"at_env_steps": 1, "set": {"cassie.push": {"force_n": [0, 50]}}}]})
+    assert curriculum.resolve(config)[1].settings.push.force_n == (0.0, 50.0)
 
 
-def test_without_stages_there_is_one() -> None:
-    assert curriculum.stages(Config()) == [curriculum.Stage(Config(), Config().total_env_steps)]
+def test_without_stages_there_is_one_part() -> None:
+    assert curriculum.resolve(from_dict({})) == [from_dict({})]
+
+
+def test_stages_begin_one_after_the_other_at_their_steps() -> None:
+    stages = Stages(from_dict({"stages": STAGES}).stages, 0, {})
+    assert [stages.advance(steps, {}) for steps in (999, 1000, 1999, 2000, 9999)] == [False, True, False, True, False]
+    assert stages.current == 2
+    behind = Stages(from_dict({"stages": STAGES}).stages, 0, {})
+    assert [behind.advance(5000, {}) for _ in range(3)] == [True, True, False]  # both are over, one an iteration
+
+
+def test_a_stage_waits_for_the_mean_of_a_metric_and_holds_up_those_behind_it() -> None:
+    stages = Stages(from_dict({"stages": WAITING}).stages, 0, {})
+    for value in [None] + [49.0] * WINDOW:
+        assert not stages.advance(3000, {"episode_length_train": value})
+        assert not stages.due(3000)
+    assert [stages.advance(3000, {"episode_length_train": 51.0}) for _ in range(5)] == [False] * 4 + [True]
+    assert stages.due(3000)  # the one behind it waits for nothing
+    assert stages.current == 1
+
+
+def test_what_a_stage_waits_for_outlives_a_break() -> None:
+    configured = from_dict({"stages": WAITING}).stages
+    before = Stages(configured, 0, {})
+    for _ in range(WINDOW - 1):
+        before.advance(3000, {"episode_length_train": 60.0})
+    after = Stages(configured, before.current, before.history)
+    assert after.advance(3000, {"episode_length_train": 60.0})
+
+
+def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
+    stages = Stages(from_dict({"stages": [WAITING[0] | {"wait_for": {"episode_lenght": 1.0}}]}).stages, 0, {})
+    with pytest.raises(ConfigError, match=r"wait_for names 'episode_lenght', which is no metric; known are iteration"):
+        stages.advance(10, {"iteration": 1})
 
 
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
-        (["soon cassie.push.force_n=[0,1]"], r"stages\[0\]: got 'soon .*expected \"STEPS"),
-        ([""], r"stages\[0\]: got ''; expected"),
-        (["100"], r"stages\[0\]: got '100'; expected"),
-        (["100 cassie.push.force_n"], r"stages\[0\]: got .*; expected"),
-        (["100 network.hidden_size=4"], r"stages\[0\]: network.hidden_size cannot change during a run"),
-        (["100 cassie.push.force=[0,1]"], r"stages\[0\]: config.cassie.push.force: unknown field"),
-        (
-            ["100 cassie.push.force_n=[5,1]"],
-            r"cassie.push.force_n: got .* expected low <= high",
-        ),
-        (["100 ppo.clip=0.1", "100 ppo.clip=0.2"], r"stages\[1\]: begins at 100 .* expected more than 100"),
+        (["4e6 ppo.clip=0.1"], r"config.stages\[0\]: expected a mapping of fields, got '4e6"),
+        ([{"at_env_steps": "soon", "set": {"ppo.clip": 0.1}}], r"stages\[0\].at_env_steps: got 'soon'; expected int"),
+        ([{"at_env_steps": 0, "set": {"ppo.clip": 0.1}}], r"stages\[0\].at_env_steps: got 0; expected"),
+        ([{"at_env_steps": 100}], r"stages\[0\].set: got nothing; expected"),
+        ([{"at_env_steps": 100, "set": {"network.hidden_size": 4}}], r"network.hidden_size cannot change during a run"),
+        ([{"at_env_steps": 100, "set": {"cassie.push.force": [0, 1]}}], r"config.cassie.push.force: unknown field"),
+        ([{"at_env_steps": 100, "set": {"cassie.push.force_n": [5, 1]}}], r"cassie.push.force_n: got .* low <= high"),
+        ([STAGES[0], STAGES[0]], r"stages\[1\].at_env_steps: got 1000; expected more than 1000"),
+        ([{"at_env_steps": 1, "set": {"ppo.clip": 0.1}, "wait_for": {"x": "much"}}], r"wait_for.x: got 'much'"),
     ],
 )
-def test_what_is_refused(stages: list[str], message: str) -> None:
+def test_what_is_refused(stages: list, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        curriculum.stages(config_module.from_dict({"stages": stages}))
+        curriculum.resolve(from_dict({"stages": stages}))
 
 
-def test_the_command_line_refuses_before_anything_starts(tmp_path: Path) -> None:
+def test_the_command_line_takes_stages_as_data_and_refuses_before_anything_starts(tmp_path: Path) -> None:
+    config = parse_train(["--config", "smoke", "--stages", "[{at_env_steps: 5, set: {ppo.clip: 0.1}}]"])[0]
+    assert curriculum.resolve(config)[1].ppo.clip == 0.1
+    assert parse_train(["--stages", "[]"])[0].stages == ()
     file = tmp_path / "config.yaml"
-    file.write_text("stages: ['100 ppo.klip=0.1']\n")
-    with pytest.raises(ConfigError, match=r"stages\[0\]: config.ppo.klip: unknown field"):
-        parse_train(["--config", str(file)])
+    file.write_text("stages: [{at_env_steps: 100, set: {ppo.klip: 0.1}}]\n")
+    for arguments in (["--config", str(file)], ["--stages", "[{at_env_steps: 100, set: {ppo.klip: 0.1}}]"]):
+        with pytest.raises(ConfigError, match=r"stages\[0\].set: config.ppo.klip: unknown field"):
+            parse_train(arguments)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cassie import commands
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
@@ -225,7 +225,7 @@ def test_commands_are_drawn_again_when_due() -> None:
 
 
 def test_command_draws() -> None:
-    settings = Config().cassie.command
+    settings = from_dict({}).cassie.command
     uniforms = np.random.default_rng(0).random((2000, 4))
     command, seconds = commands.draw_command(uniforms, settings, np)
     standing = (command == 0).all(axis=1)

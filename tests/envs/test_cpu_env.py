@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.registry import make_task
 
-TASK = make_task(Config())
+TASK = make_task(from_dict({}))
 LAYING = make_task(from_dict({"cassie": {"termination": {"min_height_m": 0.0, "max_tilt_deg": 180.0}}}))  # never ends
 
 
@@ -148,7 +148,7 @@ def test_the_batch_equals_plain_mujoco() -> None:
     action = rng.uniform(-0.5, 0.5, (2, 10))
     after, _ = envs.step(state, action, rng)
     for env in range(2):
-        model = make_task(Config()).model
+        model = make_task(from_dict({})).model
         model.opt.timestep = state.model_fields["timestep"][env]
         for name in set(state.model_fields) - {"timestep"}:
             getattr(model, name)[:] = state.model_fields[name][env]

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import hasrl_jax  # noqa: F401 (importing it registers the environments)
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.gymnasium import TaskEnv, make
 from hasrl_jax.envs.registration import ENVIRONMENTS

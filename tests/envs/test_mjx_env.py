@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from hasrl_jax.bench import engine_parity as parity
-from hasrl_jax.config import schema as config_module
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.mjx_engine import MjxEngine, MjxEnvState, make_engine
 from hasrl_jax.envs.mjx_physics import find_loops
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 
-CARTPOLE = config_module.from_dict({"task": "cartpole"})
+CARTPOLE = from_dict({"task": "cartpole"})
 NUM_ENVS = 4
 TIME_LIMIT = 6
 
@@ -96,7 +96,7 @@ def test_a_diverged_environment_is_reported_and_reset(step: Callable, start: Mjx
 
 def test_the_same_uniforms_give_the_same_robot() -> None:
     """Model fields from NumPy float64 and JAX float32 agree to 1e-6, relative, and so does the first observation."""
-    task = make_task(Config())
+    task = make_task(from_dict({}))
     uniforms = np.random.default_rng(1).random((3, task.reset_uniforms))
     expected = task.reset(uniforms, np)
     engine = make_engine(task, "jax", TIME_LIMIT)
@@ -114,7 +114,7 @@ def test_cassie_agrees_with_c_in_double_precision() -> None:
 
     The solver stops early in both engines, and contacts amplify the rounding in between.
     """
-    config = config_module.from_dict({"cassie": {"push": {"force_n": [50, 200], "interval_s": [0, 0.5]}}})
+    config = from_dict({"cassie": {"push": {"force_n": [50, 200], "interval_s": [0, 0.5]}}})
     report = parity.measure(config, num_states=6, horizons=(1, 3), double_precision=True)
     task = make_task(config)
     for horizon, tolerance in (("1", 1e-9), ("3", 1e-4)):
@@ -141,7 +141,7 @@ def test_cartpole_agrees_with_c_in_single_precision() -> None:
 
 
 def test_loops_hold_in_the_initial_pose() -> None:
-    model = make_task(Config()).model
+    model = make_task(from_dict({})).model
     loops = find_loops(model)
     assert loops.body.shape == (4, 2)
     assert loops.moved_by.shape == (4, 2, model.nv)
@@ -169,7 +169,7 @@ def test_unsupported_settings_are_named() -> None:
 @pytest.mark.parametrize(("contacts", "constraints", "overflow"), [(16, 64, [0, 0]), (1, 64, [1, 0]), (16, 14, [0, 1])])
 def test_warp_reports_its_limits(contacts: int, constraints: int, overflow: list[int]) -> None:
     pytest.importorskip("warp")
-    engine = make_engine(make_task(Config()), "warp", 100, NUM_ENVS, contacts, constraints, warp_on_cpu=True)
+    engine = make_engine(make_task(from_dict({})), "warp", 100, NUM_ENVS, contacts, constraints, warp_on_cpu=True)
     state = jax.vmap(engine.reset)(jax.random.split(jax.random.PRNGKey(0), NUM_ENVS))
     advance, seen = jax.jit(jax.vmap(engine.step)), np.zeros(2, int)
     for _ in range(12):  # enough to land on both feet

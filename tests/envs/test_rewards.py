@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cassie import clock, rewards
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.cassie.settings import RewardConfig
@@ -86,7 +86,7 @@ def _step(constants: cassie.Constants, task: Task, **changes: np.ndarray):
 
 
 def _task(reward: RewardConfig) -> tuple[cassie.Constants, Task]:
-    config = Config()
+    config = from_dict({})
     task = cassie.make(dataclasses.replace(config, cassie=dataclasses.replace(config.cassie, reward=reward)))
     return task.step.args[0], task
 

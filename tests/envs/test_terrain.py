@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cassie import terrain
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.mjx_engine import make_engine

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, shipped
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.cassie.commands import PUSH_UNIFORMS, draw_push, next_push
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.evaluate import scorecard
@@ -42,7 +43,7 @@ def test_a_row_sets_the_task_and_keeps_the_policy_s_own_clock() -> None:
 
 
 def test_an_episode_meets_one_push() -> None:
-    config = scorecard.row_config(Config(), Row("push", (1.0, 1.0), push_n=150.0), 60.0)
+    config = scorecard.row_config(from_dict({}), Row("push", (1.0, 1.0), push_n=150.0), 60.0)
     settings, step_s = config.cassie.push, config.physics.env_step_s
     rng = np.random.default_rng(0)
     push, push_s = draw_push(rng.random((200, PUSH_UNIFORMS)), settings, np)
@@ -63,18 +64,18 @@ def test_pushed_episodes_are_those_up_at_the_push() -> None:
         "diverged": np.zeros(4, bool),
         "forward_speed": nothing,
     }
-    summary = scorecard.summarize_row(row, scorecard.row_config(Config(), row, 60.0), [part])
+    summary = scorecard.summarize_row(row, scorecard.row_config(from_dict({}), row, 60.0), [part])
     assert summary["pushed_episodes"] == 3
     np.testing.assert_allclose(summary["share_up"]["mean"], 2 / 3)
     assert summary["forward_speed"]["mean"] is None
 
 
 def test_a_zero_policy_never_acts() -> None:
-    config, parameters = load_baseline("zero", Config())
+    config, parameters = load_baseline("zero", from_dict({}))
     assert not any(array.any() for name, array in parameters.items() if name.startswith("policy/lstm"))
     episodes = evaluate.run_episodes(config, scorecard.make_task(config), parameters, 2, 0)
     assert (episodes.seconds < 3).all()
-    _, random = load_baseline("random", Config())
+    _, random = load_baseline("random", from_dict({}))
     assert random["policy/lstm_0_input"].any()
 
 
@@ -104,7 +105,7 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
         yield {"title": "", "randomized": False, "share_up": {"mean": None}}
         raise KeyboardInterrupt
 
-    zero, random = load_baseline("zero", Config()), load_baseline("random", Config())
+    zero, random = load_baseline("zero", from_dict({})), load_baseline("random", from_dict({}))
     digest = scorecard._digest(*zero, seconds=4.0)
     report = {"episodes": 3, "seconds": 4.0, "seed": 0, "digests": {"zero": digest}, "policies": {"zero": ["a row"]}}
     (tmp_path / "scorecard.json").write_text(json.dumps(report))

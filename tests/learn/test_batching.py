@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from hasrl_jax.learn.batching import PER_TRAJECTORY_FIELDS, minibatch_indices, pad_segments
-from hasrl_jax.types import Trajectory
+from hasrl_jax.collect.buffer import pad_segments
+from hasrl_jax.learn.batching import minibatch_indices
+from hasrl_jax.types import SEGMENT_FIELDS, Trajectory
 
 
 def _flat(transitions: int, segments: int) -> dict[str, np.ndarray]:
@@ -24,7 +25,7 @@ def test_pad_segments_against_a_loop() -> None:
     for name, array in padded._asdict().items():
         assert array.dtype == flat[name].dtype
         for row in range(6):
-            if name in PER_TRAJECTORY_FIELDS:
+            if name in SEGMENT_FIELDS:
                 expected = flat[name][row] if row < 4 else np.zeros_like(flat[name][0])
             else:
                 expected = np.zeros((5, *flat[name].shape[1:]), flat[name].dtype)

@@ -9,7 +9,8 @@ import pytest
 
 from hasrl_jax.cli import export
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.config.schema import from_dict, shipped
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout as evaluate

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.ppo import LearnerState, init_learner
@@ -259,7 +259,7 @@ def test_policy_round_trip(tmp_path: Path, learner: LearnerState) -> None:
 
 
 def test_released_policy_is_small(tmp_path: Path) -> None:
-    learner = jax.eval_shape(lambda: init_learner(Config(), 50, 10, None, jax.random.key(0)))
+    learner = jax.eval_shape(lambda: init_learner(from_dict({}), 50, 10, None, jax.random.key(0)))
     flat = checkpoint._named_leaves((learner.policy_params, learner.value_params))
     rng = np.random.default_rng(0)
     parameters = {name: rng.standard_normal(leaf.shape, np.float32) for name, leaf in flat.items()}

@@ -51,18 +51,18 @@ def test_records_are_plain_json(tmp_path: Path) -> None:
 
 def test_tensorboard_events(tmp_path: Path) -> None:
     with MetricsWriter(tmp_path, 0) as writer:
-        writer.write({"iteration": 7, "episode_return_test": 2.5, "approx_kl": math.nan, "reward/foot_force": 0.25})
+        writer.write({"iteration": 7, "eval_return": 2.5, "approx_kl": math.nan, "reward/foot_force": 0.25})
     *_, event = events(tmp_path)
     assert event.step == 7
     values = {value.tag: value.simple_value for value in event.summary.value}
-    assert values == {"learner/iteration": 7, "test/episode_return": 2.5, "reward/foot_force": 0.25}
+    assert values == {"learner/iteration": 7, "eval/return": 2.5, "reward/foot_force": 0.25}
 
 
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
         ("episode_return_train", "train/episode_return"),
-        ("episode_length_test", "test/episode_length"),
+        ("eval_length", "eval/length"),
         ("test_seconds", "time/test_seconds"),
         ("env_steps_per_second", "time/env_steps_per_second"),
         ("workers_lost", "collect/workers_lost"),
@@ -116,11 +116,11 @@ def test_unwritable_place(tmp_path: Path) -> None:
 
 def test_plain_progress_is_one_line_per_iteration(capsys: pytest.CaptureFixture) -> None:
     printer = ProgressPrinter(total_env_steps=3000, start_env_steps=1000)
-    printer.update({"iteration": 1, "env_steps": 2000, "episode_return_test": 3.0, "approx_kl": math.nan})
+    printer.update({"iteration": 1, "env_steps": 2000, "eval_return": 3.0, "approx_kl": math.nan})
     printer.update({"iteration": 2.0, "env_steps": 3000, "env_steps_per_second": 12345.6, "entropy": 1.5})
     printer.close()
     first, second = capsys.readouterr().out.splitlines()
-    assert "iteration 1 | 2,000 env steps | -/s" in first and "test return 3.0" in first and "KL - " in first
+    assert "iteration 1 | 2,000 env steps | -/s" in first and "eval return 3.0" in first and "KL - " in first
     assert "12,346/s" in second and "entropy 1.50" in second and second.endswith("0:00:00 left")
     assert "test" not in second
 

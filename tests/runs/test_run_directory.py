@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from hasrl_jax.config.schema import Config, dump_yaml, from_dict
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import dump_yaml
+from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import RunError
 from hasrl_jax.runs.directory import RunDirectory, load_run_config, open_run
 
 HOLD = """
 import sys, time
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.runs.directory import open_run
 with open_run(from_dict({"run_dir": sys.argv[1]}), resume=False):
     print("held", flush=True)
@@ -43,7 +45,7 @@ def test_new_run_and_resume(tmp_path: Path) -> None:
 
 def test_default_names_are_never_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with open_run(Config(), resume=False) as first, open_run(Config(), resume=False) as second:
+    with open_run(from_dict({}), resume=False) as first, open_run(from_dict({}), resume=False) as second:
         assert first.path != second.path
         assert all(run.path.match("runs/cassie-20*-*") for run in (first, second))
 
@@ -125,7 +127,7 @@ def test_missing_and_foreign_directories(tmp_path: Path) -> None:
     ],
 )
 def test_damaged_configuration(tmp_path: Path, damage) -> None:
-    text = damage(dump_yaml(Config()))
+    text = damage(dump_yaml(from_dict({})))
     (tmp_path / "config.yaml").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(RunError, match=rf"^{tmp_path}/config\.yaml: [^\n]+$"):
         load_run_config(tmp_path)

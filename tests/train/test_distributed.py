@@ -15,7 +15,8 @@ import two_processes
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.plan import make_plan
-from hasrl_jax.config.schema import DistributedConfig, from_dict
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import DistributedConfig
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo

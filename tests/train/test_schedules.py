@@ -14,11 +14,12 @@ import psutil
 import pytest
 
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.collect import collectors
+from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.decoupled import FreePool
+from hasrl_jax.collect.protocol import Networks
 from hasrl_jax.collect.supervisor import CpuPool
-from hasrl_jax.config import schema as config_module
-from hasrl_jax.config.limits import check
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import distributions, normalize, ppo
@@ -46,7 +47,7 @@ Hook = Callable[[dict], None]
 @functools.cache
 def compiled(schedule: str) -> ppo.Update:
     """One program per schedule for the whole file."""
-    config = config_module.from_dict(TINY | {"schedule": schedule})
+    config = from_dict(TINY | {"schedule": schedule})
     task = make_task(config)
     return ppo.make_update(config, task.observation_size, task.action_size, task.mirror, ppo.make_mesh())
 
@@ -73,7 +74,7 @@ def run(tmp_path, monkeypatch):
     """`run(changes, hook, make_update)`: trains; `hook` sees each record. Returns (exit status, records)."""
 
     def go(changes: dict, hook: Hook | None = None, make_update: Callable | None = None) -> tuple[int, list[dict]]:
-        config = config_module.from_dict(changes, config_module.from_dict(TINY | {"run_dir": str(tmp_path / "run")}))
+        config = from_dict(changes, from_dict(TINY | {"run_dir": str(tmp_path / "run")}))
         deadline = time.monotonic() + 120
 
         def update(printer: object, record: dict) -> None:
@@ -135,15 +136,16 @@ def test_replays_stay_within_their_ratio_and_add_no_environment_steps(run, monke
 @pytest.mark.parametrize("schedule", ["overlap", "decoupled"])
 def test_log_probs_are_those_of_the_parameters_that_acted(schedule):
     """The learner has moved on before the trajectories are read; they still say who acted."""
-    config = config_module.from_dict(TINY | {"schedule": schedule})
+    config = from_dict(TINY | {"schedule": schedule})
     task = make_task(config)
     sizes = task.observation_size, task.action_size
     old, new = (ppo.init_learner(config, *sizes, task.mirror, jax.random.key(seed)) for seed in (0, 1))
-    policy, _ = make_networks(config.network, *sizes, task.mirror)
-    with collectors.make_collector(config, task, ppo.make_mesh()) as collector:
-        collector.start(old, 0, version=0)
+    networks = Networks(*make_networks(config.network, *sizes, task.mirror))
+    policy = networks.policy
+    with make_collector(config, task, ppo.make_mesh(), networks) as collector:
+        collector.start(ppo.acting_parameters(old), 0, version=0)
         first = collector.finish().trajectory
-        collector.start(new, 1, version=1)
+        collector.start(ppo.acting_parameters(new), 1, version=1)
         batches = [first] + [collector.finish().trajectory for _ in range(4 if schedule == "decoupled" else 1)]
     seen = set()
     for steps in batches:
@@ -162,7 +164,7 @@ def test_log_probs_are_those_of_the_parameters_that_acted(schedule):
 def test_decoupling_needs_workers_of_its_own(backend):
     expected = f"^schedule: got 'decoupled'; expected 'sync' or 'overlap' with backend {backend}"
     with pytest.raises(ConfigError, match=expected):
-        check(config_module.from_dict({"schedule": "decoupled", "backend": backend}))
+        check(from_dict({"schedule": "decoupled", "backend": backend}))
 
 
 def lose(number: signal.Signals, count: int) -> Hook:
@@ -256,8 +258,8 @@ def test_a_learner_that_fails_leaves_one_cause_and_a_checkpoint(schedule, error,
 def test_a_decoupled_run_resumes(run, tmp_path):
     status, records = run({"schedule": "decoupled", "total_env_steps": 3 * STEPS})
     assert status == 0
-    config = config_module.from_dict(TINY | {"schedule": "decoupled", "run_dir": str(tmp_path / "run")})
-    resumed = config_module.from_dict({"total_env_steps": records[-1]["env_steps"] + STEPS}, config)
+    config = from_dict(TINY | {"schedule": "decoupled", "run_dir": str(tmp_path / "run")})
+    resumed = from_dict({"total_env_steps": records[-1]["env_steps"] + STEPS}, config)
     train.train(resumed, resume=True, make_update=lambda *_: compiled("decoupled"))
     after = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert after[: len(records)] == records

@@ -13,8 +13,8 @@ import psutil
 import pytest
 
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.config.limits import check
-from hasrl_jax.config.schema import DEFAULT_CONFIG, load_yaml
+from hasrl_jax.config.checks import check
+from hasrl_jax.config.files import DEFAULT_CONFIG, load_yaml
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.train import loop as train
 
@@ -32,8 +32,8 @@ checkpoint: {every_iterations: 2}
 total_env_steps: 512
 """
 METRICS = {
-    *("iteration", "env_steps", "episode_return_train", "episode_return_test", "episode_length_train"),
-    *("episode_length_test", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction"),
+    *("iteration", "env_steps", "episode_return_train", "eval_return", "episode_length_train"),
+    *("eval_length", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction"),
     *("explained_variance", "policy_lag", "env_steps_per_second", "collect_seconds", "update_seconds", "test_seconds"),
     *("reward/foot_force", "reward/action_change", "diverged_envs", "workers_lost"),
 }
@@ -282,4 +282,4 @@ def test_the_lstm_learns_a_task_that_needs_memory(tmp_path):
     arguments = ["--config", str(CONFIGS / "cartpole.yaml"), "--run-dir", str(run), "--num-workers", "2"]
     assert train.main(arguments) == 0
     last = records(run)[-1]
-    assert last["episode_length_test"] == 200, f"after {time.monotonic() - started:.0f} s: {last}"
+    assert last["eval_length"] == 200, f"after {time.monotonic() - started:.0f} s: {last}"

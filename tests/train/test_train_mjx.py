@@ -154,7 +154,7 @@ def test_too_little_memory_is_one_line(tiny: Path, tmp_path: Path, monkeypatch, 
     def fail(*_: object) -> None:
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
-    monkeypatch.setattr("hasrl_jax.collect.mjx.MjxCollector._collect", fail)
+    monkeypatch.setattr("hasrl_jax.collect.mjx.MjxRollout._collect", fail)
     assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "run")]) == 1
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1

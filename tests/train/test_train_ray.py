@@ -28,7 +28,7 @@ total_env_steps: 256
 def untimed(run: Path, count: int) -> list[dict]:
     """The first records without what may differ between two runs: times, and the test of the last iteration."""
     records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()][:count]
-    return [{n: v for n, v in record.items() if "second" not in n and "_test" not in n} for record in records]
+    return [{n: v for n, v in record.items() if "second" not in n and "eval_" not in n} for record in records]
 
 
 def test_a_run_gives_the_numbers_of_the_cpu_pool_and_leaves_nothing(tmp_path):

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hasrl_jax.config.schema import Config, dump_yaml, from_dict
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import dump_yaml
 from hasrl_jax.errors import RunError
 from hasrl_jax.visualize import curves as figures
 
@@ -25,7 +26,7 @@ def _run(directory: Path, **changes: dict) -> Path:
             "entropy": -i,
             "collect_seconds": 1.0,
             "update_seconds": 2.0,
-            **({"episode_return_test": 5.0} if i == 3 else {}),
+            **({"eval_return": 5.0} if i == 3 else {}),
         }
         for i in range(5)
     ]
@@ -36,7 +37,7 @@ def _run(directory: Path, **changes: dict) -> Path:
 def test_metrics_keep_their_gaps(tmp_path: Path) -> None:
     run = figures.read_metrics(_run(tmp_path / "a"))
     np.testing.assert_array_equal(run["episode_return_train"], [np.nan, 1, 2, 3, 4])
-    np.testing.assert_array_equal(run["episode_return_test"], [np.nan, np.nan, np.nan, 5, np.nan])
+    np.testing.assert_array_equal(run["eval_return"], [np.nan, np.nan, np.nan, 5, np.nan])
 
 
 def test_runs_are_named_by_what_differs() -> None:
@@ -44,7 +45,7 @@ def test_runs_are_named_by_what_differs() -> None:
         from_dict({"ppo": {"policy_learning_rate": rate}, "seed": seed}) for seed, rate in enumerate((1e-4, 6e-4))
     ]
     assert figures.differences(configs) == ["policy_learning_rate 0.0001", "policy_learning_rate 0.0006"]
-    assert figures.differences([Config()]) == [""]
+    assert figures.differences([from_dict({})]) == [""]
 
 
 def test_moving_mean_skips_gaps() -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hasrl_jax.config.schema import Config, from_dict
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import CheckpointError, ConfigError

@@ -10,7 +10,7 @@ import numpy as np
 import psutil
 import pytest
 
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo

@@ -19,7 +19,8 @@ from hasrl_jax.collect.plan import Plan
 from hasrl_jax.collect.ray.cluster import connect, environment, import_ray
 from hasrl_jax.collect.ray.worker import RayWorker
 from hasrl_jax.collect.supervisor import MAX_FAILURES
-from hasrl_jax.config.schema import Config, to_dict
+from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import WorkerError
 
@@ -152,6 +153,18 @@ class RayPool:
                 self._replace(index, failure)
             elif states[index] and not loaded:
                 log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+
+    def configure(self, config: Config) -> None:
+        """Changes the settings of the task in every worker; only between `finish` and `start`."""
+        self.config = config
+        requests = {index: self._actors[index].configure.remote(to_dict(config)) for index in sorted(self.places)}
+        # One that is still starting has the old settings: another takes its place.
+        for index in set(range(self.plan.num_workers)) - self.places.keys():
+            self._replace(index, "was starting under the settings of an earlier stage", counts=False)
+        for index, request in requests.items():
+            _, failure = self._receive(index, request)
+            if failure is not None:
+                self._replace(index, failure)
 
     def close(self) -> None:
         """Ends the workers, and Ray if it was started here; a cluster that was joined goes on without them."""

@@ -9,7 +9,7 @@ import numpy as np
 from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.collect.worker import Actor
-from hasrl_jax.config.schema import from_dict
+from hasrl_jax.config.convert import from_dict
 
 
 class RayWorker:
@@ -44,6 +44,12 @@ class RayWorker:
     def silent_s(self) -> float:
         """Seconds since the last environment step."""
         return time.monotonic() - self.last_beat
+
+    def configure(self, settings: dict[str, Any]) -> bool:
+        """Changes the settings of the task; whether the episodes go on."""
+        state = self.actor.save()
+        self.actor = Actor(from_dict(settings), self.actor.plan, self.actor.index)
+        return self.actor.load(state)
 
     def save(self) -> bytes:
         return self.actor.save()

@@ -64,11 +64,11 @@ class Constants(NamedTuple):
 
 def make(config: Config) -> Task:
     """The task with its model compiled and its names resolved."""
-    ground = None if config.cassie.terrain.kind == "flat" else partial(terrain.build, config.cassie.terrain)
+    ground = None if config.settings.terrain.kind == "flat" else partial(terrain.build, config.settings.terrain)
     model = load_model(ASSET, config.physics, ground)
     nominal = randomize.nominal(model)
     constants = Constants(
-        config=config.cassie,
+        config=config.settings,
         ids=cassie_ids(model),
         nominal=nominal,
         model=model,
@@ -77,7 +77,7 @@ def make(config: Config) -> Task:
         env_step_s=config.physics.env_step_s,
     )
     drawn = commands.COMMAND_UNIFORMS + commands.PUSH_UNIFORMS
-    drawn_at_reset = drawn + 2 + NUM_ENCODERS + terrain.num_uniforms(config.cassie.terrain)
+    drawn_at_reset = drawn + 2 + NUM_ENCODERS + terrain.num_uniforms(config.settings.terrain)
     return Task(
         name="cassie",
         asset=ASSET,
@@ -93,7 +93,7 @@ def make(config: Config) -> Task:
         mirror=mirror(),
         reset=partial(reset, constants),
         control=control,
-        force=partial(force, constants) if config.cassie.push.force_n[1] > 0 else None,
+        force=partial(force, constants) if config.settings.push.force_n[1] > 0 else None,
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
+from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
+from hasrl_jax.config.schema import Config
 from hasrl_jax.visualize.pictures import gait, rewards
 
 if TYPE_CHECKING:
@@ -28,7 +30,7 @@ def draw(arguments: list[str]) -> None:
     from hasrl_jax.policy.loading import load_policy_parameters, with_physics
 
     known, rest = _parse(arguments)
-    check_number("--seed", "seed", known.seed)
+    check_number("--seed", known.seed, limits_of(Config, "seed"))
     out = known.out or Path(f"{known.name}.png")
     require_writable("--out", out, ".png")
     config, parameters = load_policy_parameters(known.run_dir, known.policy)

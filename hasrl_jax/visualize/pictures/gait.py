@@ -69,8 +69,8 @@ def draw_contacts(axes: "Axes", recording: Recording, shown: slice, config: Conf
     step_s = recording.time_s[0]
     speed = measures["forward_command"][0]
     time_s = np.linspace(0, SHOWN_S, 2000)
-    phase = np.mod(measures["phase"][0] + time_s / clock.cycle_seconds(speed, config.cassie.clock, np), 1.0)
-    asked = clock.force_clocks(phase, clock.swing_fraction(speed, config.cassie.clock, np), np)
+    phase = np.mod(measures["phase"][0] + time_s / clock.cycle_seconds(speed, config.settings.clock, np), 1.0)
+    asked = clock.force_clocks(phase, clock.swing_fraction(speed, config.settings.clock, np), np)
     for foot, (name, color, lane) in enumerate((("left_force", LEFT, 1), ("right_force", RIGHT, 0))):
         swings = asked[:, foot] < SWING
         axes.fill_between(time_s, lane - 0.5, lane + 0.5, where=swings.tolist(), color=CLOCK, linewidth=0)

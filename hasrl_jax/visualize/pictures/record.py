@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config.schema import Config, from_dict
-from hasrl_jax.envs.gymnasium import TaskEnv, undisturbed
+from hasrl_jax.config import tasks
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy.actor import act, start
 from hasrl_jax.policy.numpy_networks import Parameters
@@ -37,7 +39,7 @@ def record(config: Config, parameters: Parameters, speeds: list[float], seconds:
         raise ConfigError(f"task: the pictures show Cassie's gait, and the policy is of {config.task!r}")
     steps_each = max(1, round(seconds / config.physics.env_step_s))
     steps = steps_each * len(speeds)
-    env = TaskEnv(from_dict({"collect": {"max_episode_steps": steps}}, undisturbed(config)))
+    env = TaskEnv(from_dict({"collect": {"max_episode_steps": steps}}, tasks.find(config.task).undisturbed(config)))
     observation, _ = env.reset(seed=seed)
     acting = start(config, env.task, parameters, 1)
     rows, terminated = [], False

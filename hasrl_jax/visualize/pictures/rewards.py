@@ -24,7 +24,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
 
     recording = record(config, parameters, list(SPEEDS_M_S), SECONDS_EACH, seed)
     time_s, measures = recording.time_s, recording.measures
-    cycle_s = clock.cycle_seconds(np.mean(SPEEDS_M_S), config.cassie.clock, np)
+    cycle_s = clock.cycle_seconds(np.mean(SPEEDS_M_S), config.settings.clock, np)
     span = max(1, round(cycle_s / time_s[0]))
     figure = Figure(figsize=(8.5, 6.4), layout="constrained")
     panels = figure.subplot_mosaic([["speed", "speed"], *np.reshape(TERMS, (4, 2)).tolist()], sharex=True)
@@ -37,7 +37,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
     speed.legend(fontsize=8, ncols=3, frameon=False, loc="lower right")
     for name in TERMS:
         panel, values = panels[name], recording.reward_terms[name]
-        weight = config.cassie.reward.scale * getattr(config.cassie.reward, name)
+        weight = config.settings.reward.scale * getattr(config.settings.reward, name)
         panel.plot(time_s, values, color=FAINT, linewidth=0.8)
         panel.plot(time_s, smooth(values, span), color=LINE)
         panel.axhline(weight, color=COMMAND, linewidth=0.8, linestyle=":")

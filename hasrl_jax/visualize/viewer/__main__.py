@@ -7,7 +7,9 @@ from collections.abc import Callable
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options
+from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
+from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer import browser, native
 from hasrl_jax.visualize.viewer.live import Live, Pace
@@ -22,7 +24,7 @@ def view(arguments: list[str]) -> None:
     from hasrl_jax.policy.loading import load_policy_parameters, with_physics
 
     known, rest = _parse(arguments)
-    check_number("--seed", "seed", known.seed)
+    check_number("--seed", known.seed, limits_of(Config, "seed"))
     if not 0 <= known.port < 65536:
         raise ConfigError(f"--port: got {known.port}; expected 0 to 65535")
     if known.native:

@@ -9,9 +9,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from hasrl_jax.config.limits import LIMITS
-from hasrl_jax.config.schema import Config, from_dict
-from hasrl_jax.envs.gymnasium import TaskEnv, undisturbed
+from hasrl_jax.config import tasks
+from hasrl_jax.config.checks import limits_of
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.schema import CollectConfig, Config
+from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy.actor import Acting, act, start
@@ -58,7 +60,7 @@ class Live:
 
     Args:
       config: of the policy; its task must be "cassie". The nominal robot is not pushed but by the controls; the
-        randomised one is as `config.cassie.randomize` has it. The ground is level, whatever the policy has met.
+        randomised one is as `config.settings.randomize` has it. The ground is level, whatever the policy has met.
       parameters: as `learn.ppo.export_parameters` returns them.
       seed: of the environments.
       randomized: the robot of the first episode.
@@ -70,9 +72,9 @@ class Live:
     def __init__(self, config: Config, parameters: Parameters, seed: int, randomized: bool = False):
         if config.task != "cassie":
             raise ConfigError(f"the viewer commands speeds, and task {config.task!r} has none; give a policy of cassie")
-        longest = LIMITS["collect.max_episode_steps"][1]
+        longest = limits_of(CollectConfig, "max_episode_steps").high
         changes = {"collect": {"max_episode_steps": longest}, "cassie": {"terrain": {"kind": "flat"}}}
-        nominal = from_dict(changes, undisturbed(config))
+        nominal = from_dict(changes, tasks.find(config.task).undisturbed(config))
         drawn = from_dict({"cassie": {"randomize": {"enabled": True, "share": 1.0}}}, nominal)
         self._envs = {False: TaskEnv(nominal), True: TaskEnv(drawn)}
         for env in self._envs.values():

@@ -1,0 +1,85 @@
+"""The tasks by name: those of this package, those that installed packages offer, and any other by its place.
+
+A package offers a task as an entry point of the group `hasrl_jax.tasks` whose value is a `TaskSpec`.
+"""
+
+import dataclasses
+import functools
+import importlib
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hasrl_jax.config.limits import shown
+from hasrl_jax.config.schema import Config
+from hasrl_jax.errors import ConfigError
+
+ENTRY_POINTS = "hasrl_jax.tasks"
+BUILT_IN = {"cassie": "hasrl_jax.envs.cassie.spec:SPEC", "cartpole": "hasrl_jax.envs.cartpole.spec:SPEC"}
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What there is to know of a task before it is made."""
+
+    name: str  # of the task, and of the group of its settings in a configuration
+    make: Callable[[Config], Any]  # -> envs.task.Task
+    recipe: Path  # the YAML file that trains it when no other is named
+    settings: type | None = None  # frozen dataclass of its own settings, with a default for every field
+    check: Callable[[Config], None] | None = None  # raises ConfigError for settings that do not fit together
+    undisturbed: Callable[[Config], Config] = lambda config: config  # the nominal robot, disturbed by nobody
+
+
+def find(name: str) -> TaskSpec:
+    """The task of this name.
+
+    Raises:
+      ConfigError: there is none; lists those that there are.
+    """
+    place = name if ":" in name else _places().get(name)
+    if place is None:
+        known = ", ".join(_places())
+        raise ConfigError(f"task: got {shown(name)}; expected {known}, or MODULE:NAME of a TaskSpec")
+    return _load(name, place)
+
+
+@functools.cache
+def config_class(task: str) -> type[Config]:
+    """`Config` with the group of settings of this task.
+
+    Raises:
+      ConfigError: there is no such task.
+    """
+    spec = find(task)
+    if spec.settings is None:
+        return Config
+    group = (spec.name, spec.settings, dataclasses.field(default_factory=spec.settings))
+    return dataclasses.make_dataclass("Config", [group], bases=(Config,), namespace={"section": spec.name}, frozen=True)
+
+
+def offered() -> list[str]:
+    """Names of the tasks of this package and of installed ones."""
+    return list(_places())
+
+
+@functools.cache
+def _places() -> dict[str, str]:
+    found = {point.name: point.value for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    return BUILT_IN | {name: value for name, value in found.items() if name not in BUILT_IN}
+
+
+@functools.cache
+def _load(name: str, place: str) -> TaskSpec:
+    module, _, attribute = place.partition(":")
+    try:
+        spec = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"task: got {shown(name)}, which cannot be loaded from {place} ({error})") from None
+    if not isinstance(spec, TaskSpec):
+        raise ConfigError(f"task: got {shown(name)}; {place} is no TaskSpec but {shown(spec)}")
+    taken = {field.name for field in dataclasses.fields(Config)}
+    if not spec.name.isidentifier() or spec.name in taken:
+        raise ConfigError(f"task: {place} has the name {shown(spec.name)}; expected an identifier that is no field")
+    return spec

@@ -1,0 +1,50 @@
+"""What there is to know of the walking task before it is made."""
+
+from hasrl_jax.config.checks import limits_of
+from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import CONFIG_FOLDER
+from hasrl_jax.config.limits import require
+from hasrl_jax.config.schema import Config, PhysicsConfig
+from hasrl_jax.config.tasks import TaskSpec
+from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.envs.cassie.task import make
+
+
+def check(config: Config) -> None:
+    """What must fit together among the settings of the walking task.
+
+    Raises:
+      ConfigError: names the field, the value and what would work.
+    """
+    settings: CassieConfig = config.settings
+    fastest = max(abs(speed) for speed in settings.command.forward_m_s)
+    require(
+        settings.clock.cycle_s + settings.clock.cycle_per_speed_s * fastest > 0.1,
+        "cassie.clock.cycle_per_speed_s",
+        settings.clock.cycle_per_speed_s,
+        f"a gait cycle above 0.1 s at {fastest:g} m/s",
+    )
+    if settings.randomize.enabled:
+        scale, timestep_s = settings.randomize.physics_rate_scale, config.physics.timestep_s
+        low, high = limits_of(PhysicsConfig, "timestep_s")
+        require(
+            low <= timestep_s * scale[0] and timestep_s * scale[1] <= high,
+            "cassie.randomize.physics_rate_scale",
+            scale,
+            f"physics steps from {low:g} to {high:g} s, where physics.timestep_s is {timestep_s:g}",
+        )
+
+
+def undisturbed(config: Config) -> Config:
+    """`config` with the nominal robot and no pushes but those that are asked for."""
+    return from_dict({"cassie": {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}}, config)
+
+
+SPEC = TaskSpec(
+    name="cassie",
+    make=make,
+    recipe=CONFIG_FOLDER / "cassie_walk.yaml",
+    settings=CassieConfig,
+    check=check,
+    undisturbed=undisturbed,
+)
