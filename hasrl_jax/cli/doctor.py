@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from hasrl_jax.cli.options import OneLineParser
 from hasrl_jax.visualize import opengl
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "gymnasium")
@@ -151,14 +152,12 @@ def _version(package: str) -> str | None:
         return None
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit status."""
+    description = "Says whether this machine can do the work, one line per check."
+    OneLineParser(prog="python -m hasrl_jax.doctor", description=description, allow_abbrev=False).parse_args(argv)
     failed = False
     for check in examine():
         print(f"{check.status:4s}  {check.name:18s} {check.text}", flush=True)
         failed |= check.status == "fail"
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Command lines: a YAML file, then dotted overrides of any config field, then the checks."""
+"""What the command lines share: dotted overrides of any config field, the checks, and errors on one line."""
 
 import contextlib
 import dataclasses
@@ -10,65 +10,19 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from hasrl_jax.cli.options import OneLineParser
-from hasrl_jax.config import curriculum, strict_yaml
+from hasrl_jax.config import strict_yaml
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
-from hasrl_jax.config.files import load_yaml, recipe
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, HasrlError
 
 SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
-
-
-def parse_train(arguments: list[str]) -> tuple[Config, bool, str | None]:
-    """The configuration of a run, whether it continues one, and the policy that it starts from.
-
-    `--config FILE` reads a YAML file, or one of `configs/` by name (default: the recipe of the task), `--resume DIR`
-    the configuration of that run; `--init-policy SOURCE` names a policy file, a run directory or "released";
-    everything else overrides single fields, `--ppo.clip 0.1`.
-
-    Raises:
-      ConfigError: an impossible value; RunError: `--resume` names no run.
-    """
-    from hasrl_jax.runs.directory import load_run_config
-
-    parser = OneLineParser(prog="python -m hasrl_jax.train", add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", default=None, metavar="FILE")
-    parser.add_argument("--resume", type=Path, default=None, metavar="DIR")
-    parser.add_argument("--init-policy", default=None, metavar="SOURCE")
-    parser.add_argument("--task", default=None)
-    known, rest = parser.parse_known_args(arguments)
-    for name in ("config", "init_policy", "task"):
-        if getattr(known, name) == "":
-            raise ConfigError(f"--{name.replace('_', '-')}: got an empty text; leave it out, or name one")
-    if known.init_policy and known.resume:
-        raise ConfigError("--init-policy and --resume: give one of them; a resumed run goes on with its own policy")
-    if known.config and known.resume:
-        raise ConfigError("--config and --resume: give one of them; a resumed run brings its own configuration")
-    if known.resume and any(_option(argument) == "--run-dir" for argument in rest):
-        raise ConfigError("--resume and --run-dir: give only --resume; a resumed run goes on in its own directory")
-    if known.resume:
-        base = load_run_config(known.resume)
-        if known.task not in (None, base.task):
-            raise ConfigError(f"--task: got {known.task}; {known.resume} is a run of task {base.task}")
-    elif known.config:
-        base = load_yaml(known.config)
-    else:
-        base = recipe(known.task or Config().task)
-    if known.task:
-        base = from_dict({"task": known.task}, base)
-    config = override(base, rest, "train")
-    curriculum.resolve(config)  # refuses stages that cannot work
-    if known.resume:
-        config = from_dict({"run_dir": str(known.resume)}, config)
-    return config, known.resume is not None, known.init_policy
 
 
 def override(base: Config, arguments: list[str], program: str) -> Config:
@@ -166,14 +120,14 @@ def log_to_terminal() -> None:
         logger.addHandler(logging.StreamHandler())
 
 
-def _option(argument: str) -> str:
+def option_name(argument: str) -> str:
     """The name of an option, as it is documented: without a value, with hyphens."""
     return argument.partition("=")[0].replace("_", "-")
 
 
 def _expand(argument: str) -> str:
     name, equals, value = argument.partition("=")
-    return SHORTHAND.get(_option(argument), name) + equals + value
+    return SHORTHAND.get(option_name(argument), name) + equals + value
 
 
 def _options(settings: dict[str, Any], prefix: str = "--") -> Iterator[str]:
@@ -189,7 +143,7 @@ def _options(settings: dict[str, Any], prefix: str = "--") -> Iterator[str]:
 def _refuse_unknown_options(arguments: list[str], base: Config) -> None:
     known = [*_options(to_dict(base)), "--config", "--resume", "--init-policy"]
     for argument in arguments:
-        option = _option(argument)
+        option = option_name(argument)
         if option.startswith("--") and option not in {*known, "--help"}:
             closest = difflib.get_close_matches(option, known, n=1)
             hint = f"did you mean {closest[0]}?" if closest else "see --help"

@@ -1,29 +1,22 @@
-"""Loads a robot model and applies the physics options; names become ids here and nowhere else."""
+"""Loads a model and applies the physics options."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
-import numpy as np
 
 from hasrl_jax.config.schema import PhysicsConfig
 
-ASSETS = Path(__file__).parent
-MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")  # per leg, left leg first
-PASSIVE_JOINTS = ("shin", "tarsus", "foot")  # per leg, left leg first
-SIDES = ("left", "right")
-
 
 def load_model(
-    asset: str, physics: PhysicsConfig, ground: Callable[[mujoco.MjSpec], None] | None = None, visual: bool = False
+    asset: Path, physics: PhysicsConfig, ground: Callable[[mujoco.MjSpec], None] | None = None, visual: bool = False
 ) -> mujoco.MjModel:
-    """Compiles a model file of this folder with the configured time step, solver and integrator.
+    """Compiles the MJCF file `asset` with the configured time step, solver and integrator.
 
     `ground` edits the description first, see `Task.ground`.
     Shapes that only pictures need cost physics 6 % and most of a model's memory, so they come only with `visual`.
     """
-    spec = mujoco.MjSpec.from_file(str(ASSETS / asset))
+    spec = mujoco.MjSpec.from_file(str(asset))
     if ground:
         ground(spec)
     spec.compiler.discardvisual = not visual
@@ -34,42 +27,3 @@ def load_model(
     model.opt.iterations = physics.solver_iterations
     model.opt.ls_iterations = physics.line_search_iterations
     return model
-
-
-class CassieIds(NamedTuple):
-    """Where the numbers of the Cassie task stand in qpos, qvel and sensordata."""
-
-    motor_qpos: np.ndarray  # [10]
-    motor_qvel: np.ndarray  # [10]
-    passive_qpos: np.ndarray  # [6]
-    passive_qvel: np.ndarray  # [6]
-    hip_roll_qvel: np.ndarray  # [2]
-    acceleration: np.ndarray  # [3] in sensordata
-    foot_force: np.ndarray  # [2]
-    foot_orientation: np.ndarray  # [2, 4]
-    foot_velocity: np.ndarray  # [2, 3]
-    torque: np.ndarray  # [10]
-    motor_speed: np.ndarray  # [10]
-
-
-def cassie_ids(model: mujoco.MjModel) -> CassieIds:
-    """Resolves every name that the task reads."""
-    motors = [model.joint(f"{side}-{name}") for side in SIDES for name in MOTORS]
-    passive = [model.joint(f"{side}-{name}") for side in SIDES for name in PASSIVE_JOINTS]
-
-    def sensors(*names: str) -> np.ndarray:
-        return np.array([model.sensor(name).adr[0] + np.arange(model.sensor(name).dim[0]) for name in names])
-
-    return CassieIds(
-        motor_qpos=np.array([joint.qposadr[0] for joint in motors]),
-        motor_qvel=np.array([joint.dofadr[0] for joint in motors]),
-        passive_qpos=np.array([joint.qposadr[0] for joint in passive]),
-        passive_qvel=np.array([joint.dofadr[0] for joint in passive]),
-        hip_roll_qvel=np.array([motors[0].dofadr[0], motors[5].dofadr[0]]),
-        acceleration=sensors("pelvis-acceleration")[0],
-        foot_force=sensors("left-foot-force", "right-foot-force")[:, 0],
-        foot_orientation=sensors("left-foot-orientation", "right-foot-orientation"),
-        foot_velocity=sensors("left-foot-velocity", "right-foot-velocity"),
-        torque=sensors(*(f"{side}-{name}-torque" for side in SIDES for name in MOTORS))[:, 0],
-        motor_speed=sensors(*(f"{side}-{name}-speed" for side in SIDES for name in MOTORS))[:, 0],
-    )

@@ -7,6 +7,7 @@ the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, w
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -49,7 +50,7 @@ class Task:
     """One task: its model, sizes and functions."""
 
     name: str
-    asset: str  # file of the model in `assets`, for a copy with its visual shapes
+    asset: Path  # MJCF file of the model, for a copy with its visual shapes
     ground: Callable[[mujoco.MjSpec], None] | None  # puts ground that changes by episode into a copy of the model
     model: mujoco.MjModel  # without visual shapes
     steps_per_env_step: int  # physics steps per environment step

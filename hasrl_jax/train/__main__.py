@@ -2,7 +2,7 @@
 
 import sys
 
-from hasrl_jax.train.loop import main
+from hasrl_jax.cli.train import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,8 +1,7 @@
-"""The main job: collect, update, log, evaluate, save. `python -m hasrl_jax.train --backend=cpu_pool`."""
+"""The main job: collect, update, log, evaluate, save."""
 
 import logging
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 
-from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.protocol import Collector, Experience, Networks
 from hasrl_jax.config import curriculum
@@ -310,13 +308,3 @@ def stop_signal() -> Iterator[Stop]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def main(argv: list[str] | None = None) -> int:
-    """The command line; returns the exit status."""
-    cli.log_to_terminal()
-    return cli.run(lambda: train(*cli.parse_train(sys.argv[1:] if argv is None else argv)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

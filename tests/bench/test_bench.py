@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from hasrl_jax.bench import mjx, report
-from hasrl_jax.bench.__main__ import main
+from hasrl_jax.cli.bench import main
 from hasrl_jax.config.schema import Config
 
 TINY = """

@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from hasrl_jax.bench import compare
-from hasrl_jax.bench.__main__ import main
+from hasrl_jax.cli.bench import main
 
 TINY = """
 task: cartpole

@@ -119,12 +119,14 @@ def test_lost_workers_cost_their_own_part_and_are_replaced(make_pool, parameters
 def test_workers_that_raise_end_in_one_error_with_the_cause(make_pool, parameters, caplog):
     pool = make_pool()
     broken = parameters | {"policy/mean_bias": np.full(1, np.nan, np.float32)}
-    with pytest.raises(WorkerError, match=r"^every worker was lost.* raised DivergenceError: .*not finite$"):
+    with pytest.raises(WorkerError, match=r"^every worker was lost.* raised \S*DivergenceError: .*not finite$"):
         run(pool, broken)
     assert caplog.text.count("ray::RayWorker.collect") == 2, "the tracebacks are shown"
     assert len(run(pool, parameters, 1).statistics) > 0
     pool._failures = [MAX_FAILURES - 1] * 2
-    with pytest.raises(WorkerError, match=r"^worker \d failed 3 times in a row; the last one raised FloatingPoint"):
+    with pytest.raises(
+        WorkerError, match=r"^worker \d failed 3 times in a row; the last one raised \S*DivergenceError"
+    ):
         run(pool, broken, 2)
 
 

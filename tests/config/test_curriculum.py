@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hasrl_jax.cli.parsing import parse_train
+from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config import curriculum
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.curriculum import WINDOW, Stages

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hasrl_jax.envs.model import ASSETS
+from hasrl_jax.envs.cassie.task import ASSET
 
 PARAMETERS: dict[str, Any] = json.loads((Path(__file__).parents[1] / "data" / "cassie_parameters.json").read_text())
 TOLERANCE = 1e-6
@@ -24,7 +24,7 @@ def by_name(record: dict[str, Any]) -> str:
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
     """The compiled model exactly as the file states it, before any physics option is applied."""
-    return mujoco.MjModel.from_xml_path(str(ASSETS / "cassie" / "cassie.xml"))
+    return mujoco.MjModel.from_xml_path(str(ASSET))
 
 
 def at_stand(model: mujoco.MjModel) -> mujoco.MjData:

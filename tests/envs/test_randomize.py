@@ -8,10 +8,11 @@ import pytest
 from hasrl_jax.config.schema import PhysicsConfig
 from hasrl_jax.envs.cassie import randomize
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
+from hasrl_jax.envs.cassie.task import ASSET
 from hasrl_jax.envs.model import load_model
 
 CONFIG = RandomizeConfig()
-MODEL = load_model("cassie/cassie.xml", PhysicsConfig())
+MODEL = load_model(ASSET, PhysicsConfig())
 NOMINAL = randomize.nominal(MODEL)
 N = 400
 
@@ -69,7 +70,7 @@ def test_inertia_and_subtree_follow_the_mass(fields: dict[str, np.ndarray]) -> N
     np.testing.assert_allclose(fields["body_subtreemass"][:, 0], fields["body_mass"].sum(axis=1))
     data = mujoco.MjData(MODEL)
     for row in range(3):  # MuJoCo's own sum
-        model = load_model("cassie/cassie.xml", PhysicsConfig())
+        model = load_model(ASSET, PhysicsConfig())
         model.body_mass[:] = fields["body_mass"][row]
         mujoco.mj_setConst(model, data)
         np.testing.assert_allclose(fields["body_subtreemass"][row], model.body_subtreemass)

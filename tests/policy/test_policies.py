@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hasrl_jax.cli import export
-from hasrl_jax.cli import parsing as cli
+from hasrl_jax.cli.train import main as train_main
+from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
@@ -16,7 +17,6 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
-from hasrl_jax.train import loop as train
 
 
 def test_the_released_policy_walks_at_the_commanded_speed() -> None:
@@ -51,7 +51,7 @@ def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(t
     small = ["--collect.envs-per-worker", "2", "--collect.env-steps-per-iteration", "256", "--num-workers", "1"]
     config = Path(__file__).parents[2] / "configs" / "cartpole.yaml"
     arguments = ["--config", str(config), "--run-dir", str(run), "--total-env-steps", "256", *small]
-    assert train.main([*arguments, "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2"]) == 0
+    assert train_main([*arguments, "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2"]) == 0
     assert export.main(["--run-dir", str(run), "--out", str(out)]) == 0
     exported, from_run = policies.load_policy_parameters(None, out)[1], policies.load_policy_parameters(run, None)[1]
     assert exported.keys() == from_run.keys()
@@ -62,7 +62,7 @@ def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(t
     arguments[arguments.index(str(run))] = str(second)
     still = ["--ppo.policy-learning-rate", "1e-12", "--ppo.value-learning-rate", "1e-12", "--seed", "9"]
     more = ["--init-policy", str(out), "--ppo.minibatch-trajectories", "8", "--evaluate.episodes", "2", *still]
-    assert train.main([*arguments, *more]) == 0
+    assert train_main([*arguments, *more]) == 0
     for name, array in policies.load_policy_parameters(second, None)[1].items():
         # One iteration's observations move statistics that count as a million a little.
         np.testing.assert_allclose(array, exported[name], atol=1e-2 if "normalizer" in name else 1e-6, err_msg=name)
@@ -101,7 +101,7 @@ def test_a_policy_of_another_shape_is_refused_in_one_line(changes: dict, named: 
 
 def test_a_resumed_run_takes_no_other_policy(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--init-policy and --resume"):
-        cli.parse_train(["--resume", str(tmp_path), "--init-policy", "released"])
+        parse_train(["--resume", str(tmp_path), "--init-policy", "released"])
 
 
 def test_no_source_is_the_released_policy() -> None:

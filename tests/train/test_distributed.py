@@ -14,6 +14,7 @@ import pytest
 import two_processes
 
 from hasrl_jax.cli import parsing as cli
+from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import DistributedConfig
@@ -91,7 +92,7 @@ def test_the_command_in_two_processes_is_one_run(tmp_path, monkeypatch):
         start("-m", "hasrl_jax.train", *arguments, "--distributed.process-id", 0),
         start(SCRIPT, "command", other, *arguments, "--distributed.process-id", 1),
     ]
-    assert train.main(["--config", "tiny.yaml", "--run-dir", str(alone), "--num-workers", "2"]) == 0
+    assert train_main(["--config", "tiny.yaml", "--run-dir", str(alone), "--num-workers", "2"]) == 0
     first, second = outputs(processes)
     assert first.count("\niteration") == 2
     assert "iteration" not in second

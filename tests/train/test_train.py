@@ -13,10 +13,11 @@ import psutil
 import pytest
 
 from hasrl_jax.cli import parsing as cli
+from hasrl_jax.cli.train import main as train_main
+from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.checks import check
-from hasrl_jax.config.files import DEFAULT_CONFIG, load_yaml
+from hasrl_jax.config.files import load_yaml, recipe
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.train import loop as train
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
@@ -106,9 +107,9 @@ def test_the_command_trains_cassie_for_two_iterations(tmp_path):
 
 def test_a_resumed_run_gives_the_same_numbers(tmp_path, tiny):
     whole, halves = tmp_path / "whole", tmp_path / "halves"
-    assert train.main(["--config", str(tiny), "--run-dir", str(whole)]) == 0
-    assert train.main(["--config", str(tiny), "--run-dir", str(halves), "--total-env-steps", "256"]) == 0
-    assert train.main(["--resume", str(halves), "--total-env-steps", "512"]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(whole)]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(halves), "--total-env-steps", "256"]) == 0
+    assert train_main(["--resume", str(halves), "--total-env-steps", "512"]) == 0
     assert len(untimed(whole)) == 4
     # The first half's last iteration is evaluated because it is the last; the evaluation changes nothing.
     assert untimed(halves) == untimed(whole)
@@ -116,9 +117,9 @@ def test_a_resumed_run_gives_the_same_numbers(tmp_path, tiny):
 
 def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
     tiny.write_text(TINY + "stages: ['256 ppo.policy_learning_rate=1e-5', '384 ppo.value_learning_rate=1e-5']\n")
-    assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "whole")]) == 0
-    assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "parts"), "--total-env-steps", "384"]) == 0
-    assert train.main(["--resume", str(tmp_path / "parts"), "--total-env-steps", "512"]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "whole")]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "parts"), "--total-env-steps", "384"]) == 0
+    assert train_main(["--resume", str(tmp_path / "parts"), "--total-env-steps", "512"]) == 0
     whole = untimed(tmp_path / "whole")
     np.testing.assert_allclose([record["learning_rate"] for record in whole], [3e-4, 3e-4, 1e-5, 1e-5], rtol=1e-6)
     assert without_tests(whole) == without_tests(untimed(tmp_path / "parts"))
@@ -130,7 +131,7 @@ def without_tests(records: list[dict]) -> list[dict]:
 
 def test_overlap_acts_with_parameters_one_version_old(tmp_path, tiny):
     run = tmp_path / "run"
-    assert train.main(["--config", str(tiny), "--run-dir", str(run), "--schedule", "overlap"]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(run), "--schedule", "overlap"]) == 0
     assert [record["policy_lag"] for record in records(run)] == [0, 1, 1, 1]
 
 
@@ -173,14 +174,14 @@ def test_a_killed_run_leaves_no_worker_and_resumes(tmp_path, tiny):
     assert len(gone) == 2
     assert not alive
     saved = records(run)[-1]["iteration"] // 2 * 2
-    assert train.main(["--resume", str(run), "--total-env-steps", str((saved + 1) * 128)]) == 0
+    assert train_main(["--resume", str(run), "--total-env-steps", str((saved + 1) * 128)]) == 0
     assert [record["iteration"] for record in records(run)] == list(range(1, saved + 2))
 
 
 def test_a_run_directory_in_use_is_refused(tmp_path, tiny, capsys):
     process = start("--config", tiny, "--run-dir", tmp_path / "run", "--total-env-steps", 10**9)
     wait_for(process, "iteration 2")
-    assert train.main(["--resume", str(tmp_path / "run")]) == 1
+    assert train_main(["--resume", str(tmp_path / "run")]) == 1
     error = capsys.readouterr().err
     assert "in use" in error
     assert str(process.pid) in error
@@ -205,7 +206,7 @@ def test_a_run_directory_in_use_is_refused(tmp_path, tiny, capsys):
 )
 def test_bad_input_is_one_line_that_names_it(arguments, named, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert train.main(arguments) in (1, 2)
+    assert train_main(arguments) in (1, 2)
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1
@@ -214,7 +215,7 @@ def test_bad_input_is_one_line_that_names_it(arguments, named, capsys, tmp_path,
 
 def test_an_option_without_its_value_is_one_line(capsys):
     with pytest.raises(SystemExit) as stopped:
-        train.main(["--config"])
+        train_main(["--config"])
     assert stopped.value.code == 2
     assert capsys.readouterr().err == "error: --config: expected one argument\n"
 
@@ -224,7 +225,7 @@ def test_resuming_the_checkpoints_of_a_run_names_the_run(tmp_path, capsys):
     (run / "checkpoints" / "000000001").mkdir(parents=True)
     (run / "config.yaml").touch()
     for inside in (run / "checkpoints", run / "checkpoints" / "000000001"):
-        assert train.main(["--resume", str(inside)]) == 1
+        assert train_main(["--resume", str(inside)]) == 1
         assert capsys.readouterr().err.endswith(f"did you mean {run}?\n")
 
 
@@ -238,15 +239,21 @@ def test_too_little_memory_is_one_line(capsys):
 
 def test_a_checkpoint_of_another_network_size_is_refused(tmp_path, tiny, capsys):
     run = tmp_path / "run"
-    assert train.main(["--config", str(tiny), "--run-dir", str(run), "--total-env-steps", "128"]) == 0
-    assert train.main(["--resume", str(run), "--network.hidden-size", "16", "--total-env-steps", "256"]) == 1
+    assert train_main(["--config", str(tiny), "--run-dir", str(run), "--total-env-steps", "128"]) == 0
+    assert train_main(["--resume", str(run), "--network.hidden-size", "16", "--total-env-steps", "256"]) == 1
     assert "network.hidden_size" in capsys.readouterr().err
-    assert train.main(["--resume", str(run), "--total-env-steps", "256"]) == 0, "the refusal must not harm the run"
+    assert train_main(["--resume", str(run), "--total-env-steps", "256"]) == 0, "the refusal must not harm the run"
 
 
 def test_without_a_config_file_the_walking_recipe_is_used():
-    assert cli.parse_train([]) == (load_yaml(DEFAULT_CONFIG), False, None)
-    assert cli.parse_train(["--num-workers=3"])[0].collect.num_workers == 3
+    assert parse_train([]) == (load_yaml("cassie_walk"), False, None)
+    assert parse_train(["--num-workers=3"])[0].collect.num_workers == 3
+
+
+def test_a_task_brings_its_own_recipe():
+    config = parse_train(["--task", "cartpole"])[0]
+    assert config == load_yaml("cartpole") == recipe("cartpole")
+    assert config.settings is None and not config.stages
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
@@ -280,6 +287,6 @@ def test_the_lstm_learns_a_task_that_needs_memory(tmp_path):
     run = tmp_path / "run"
     started = time.monotonic()
     arguments = ["--config", str(CONFIGS / "cartpole.yaml"), "--run-dir", str(run), "--num-workers", "2"]
-    assert train.main(arguments) == 0
+    assert train_main(arguments) == 0
     last = records(run)[-1]
     assert last["eval_length"] == 200, f"after {time.monotonic() - started:.0f} s: {last}"

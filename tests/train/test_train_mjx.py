@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 
+from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.runs.directory import load_run_config
 from hasrl_jax.train import loop as train
@@ -47,7 +48,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two iterations in this process; the tests continue copies of it."""
     folder = tmp_path_factory.mktemp("mjx")
     (folder / "tiny.yaml").write_text(TINY)
-    assert train.main(["--config", str(folder / "tiny.yaml"), "--run-dir", str(folder / "run")]) == 0
+    assert train_main(["--config", str(folder / "tiny.yaml"), "--run-dir", str(folder / "run")]) == 0
     return folder / "run"
 
 
@@ -75,7 +76,7 @@ def test_the_command_trains_on_one_device(tmp_path: Path, tiny: Path) -> None:
 def test_metrics_are_those_of_the_cpu_pool(trained: Path, tiny: Path, tmp_path: Path) -> None:
     assert len(jax.devices()) == 8
     pool = tmp_path / "pool"
-    assert train.main(["--config", str(tiny), "--backend=cpu_pool", "--run-dir", str(pool)]) == 0
+    assert train_main(["--config", str(tiny), "--backend=cpu_pool", "--run-dir", str(pool)]) == 0
     names = [[set(record) for record in records(run)] for run in (trained, pool)]
     assert [ours - ONLY_MJX for ours in names[0]] == [theirs - ONLY_POOL for theirs in names[1]]
     for record in records(trained):
@@ -87,8 +88,8 @@ def test_metrics_are_those_of_the_cpu_pool(trained: Path, tiny: Path, tmp_path: 
 
 def test_a_resumed_run_gives_the_same_numbers(trained: Path, tiny: Path, tmp_path: Path) -> None:
     halves = tmp_path / "halves"
-    assert train.main(["--config", str(tiny), "--run-dir", str(halves), "--total-env-steps", str(STEPS)]) == 0
-    assert train.main(["--resume", str(halves), "--total-env-steps", str(2 * STEPS)]) == 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(halves), "--total-env-steps", str(STEPS)]) == 0
+    assert train_main(["--resume", str(halves), "--total-env-steps", str(2 * STEPS)]) == 0
     first, second = untimed(halves)
     expected = untimed(trained)
     assert second == expected[1]
@@ -99,7 +100,7 @@ def test_a_resumed_run_gives_the_same_numbers(trained: Path, tiny: Path, tmp_pat
 def test_overlap_acts_with_parameters_one_version_old(tiny: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     arguments = ["--config", str(tiny), "--run-dir", str(run), "--schedule", "overlap"]
-    assert train.main([*arguments, "--total-env-steps", str(3 * STEPS)]) == 0
+    assert train_main([*arguments, "--total-env-steps", str(3 * STEPS)]) == 0
     assert [record["policy_lag"] for record in records(run)] == [0, 1, 1]
 
 
@@ -107,7 +108,7 @@ def test_overlap_acts_with_parameters_one_version_old(tiny: Path, tmp_path: Path
 def test_a_policy_goes_on_in_the_other_mode(first: str, second: str, tiny: Path, tmp_path: Path, caplog) -> None:
     run, figures = tmp_path / "run", tmp_path / "figures.json"
     begin = ["--config", str(tiny), "--backend", first, "--run-dir", str(run), "--total-env-steps", str(STEPS)]
-    assert train.main(begin) == 0
+    assert train_main(begin) == 0
     played = ["--run-dir", str(run), "--episodes", "3", "--seconds", "0.2", "--json", str(figures)]
     assert evaluate.main(played) == 0
     before = json.loads(figures.read_text())
@@ -117,7 +118,7 @@ def test_a_policy_goes_on_in_the_other_mode(first: str, second: str, tiny: Path,
     train.log.addHandler(caplog.handler)  # the program's messages do not reach the root logger
     try:
         goes_on = ["--resume", str(run), "--backend", second, "--total-env-steps", str(2 * STEPS)]
-        assert train.main(goes_on) == 0
+        assert train_main(goes_on) == 0
     finally:
         train.log.removeHandler(caplog.handler)
     assert "episodes begin anew" in caplog.text
@@ -143,7 +144,7 @@ def test_bad_input_is_one_line_that_names_the_setting(
     arguments: list[str], named: list[str], tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     run = tmp_path / "run"
-    assert train.main(["--config", str(tiny), "--run-dir", str(run), *arguments]) != 0
+    assert train_main(["--config", str(tiny), "--run-dir", str(run), *arguments]) != 0
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
     assert all(name in errors[0] for name in named), errors
@@ -155,7 +156,7 @@ def test_too_little_memory_is_one_line(tiny: Path, tmp_path: Path, monkeypatch, 
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
     monkeypatch.setattr("hasrl_jax.collect.mjx.MjxRollout._collect", fail)
-    assert train.main(["--config", str(tiny), "--run-dir", str(tmp_path / "run")]) == 1
+    assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "run")]) == 1
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
     assert "mjx.num_envs: 16" in errors[0]

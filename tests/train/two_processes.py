@@ -6,6 +6,7 @@ import sys
 import jax
 import numpy as np
 
+from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.config.schema import Config, DistributedConfig, NetworkConfig, PPOConfig
 from hasrl_jax.learn import ppo
 from hasrl_jax.train import distributed
@@ -76,7 +77,7 @@ def run_command(out: str, *arguments: str) -> int:
         np.savez(out, **leaves(state.learner))
 
     train.save = save_here_too
-    return train.main(list(arguments))
+    return train_main(list(arguments))
 
 
 if __name__ == "__main__":

@@ -4,17 +4,18 @@ The policy sees the cart's position and the pole's angle, never their rates. The
 unit of reward for every step the pole stands, so a solved episode returns `collect.max_episode_steps`.
 """
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cassie.randomize import between
+from hasrl_jax.envs.draws import between
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
 
-ASSET = "cartpole/cartpole.xml"
+ASSET = Path(__file__).parent / "cartpole.xml"
 MAX_ANGLE_RAD = 0.2
 MAX_POSITION_M = 1.0
 START = 0.05  # half width of the uniform start position (m), angle (rad) and of their rates

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from hasrl_jax.envs.cassie.randomize import between
 from hasrl_jax.envs.cassie.settings import CommandConfig, PushConfig
+from hasrl_jax.envs.draws import between
 from hasrl_jax.types import Array
 
 COMMAND_UNIFORMS = 4  # forward, lateral, stand or not, time until the next draw

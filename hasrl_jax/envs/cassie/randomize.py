@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
+from hasrl_jax.envs.draws import between
 from hasrl_jax.types import Array
 
 DAMPED_JOINTS = ("hip-roll", "hip-yaw", "hip-pitch", "achilles-rod", "knee", "shin", "tarsus", "foot-crank", "foot")
@@ -97,9 +98,3 @@ def model_fields(uniforms: Array, constants: Nominal, config: RandomizeConfig, x
         "geom_friction": xp.where(drawn[..., None], friction[..., None, :], constants.geom_friction),
         "timestep": constants.timestep * rate_scale[..., 0],
     }
-
-
-def between(uniform: Array, bounds: tuple[float, float]) -> Array:
-    """A uniform number in [0, 1) moved to [low, high)."""
-    low, high = bounds
-    return low + (high - low) * uniform

@@ -4,6 +4,7 @@ Source: paper section II.A to II.D; constants of the published implementation.
 """
 
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -11,12 +12,13 @@ import numpy as np
 
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import clock, commands, randomize, rewards, terrain
+from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.settings import CassieConfig
-from hasrl_jax.envs.model import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids, load_model
+from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array, Mirror
 
-ASSET = "cassie/cassie.xml"
+ASSET = Path(__file__).parent / "cassie.xml"
 OBSERVATION_SIZE = 50
 ACTION_SIZE = 10
 NUM_ENCODERS = 16  # ten motors, six passive joints

@@ -11,8 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hasrl_jax.envs.cassie.randomize import between
 from hasrl_jax.envs.cassie.settings import TerrainConfig
+from hasrl_jax.envs.draws import between
 from hasrl_jax.types import Array
 
 BLOCKS = 96  # after the flat start; behind the last one the ground stays level

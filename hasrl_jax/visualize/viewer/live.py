@@ -80,7 +80,7 @@ class Live:
         for env in self._envs.values():
             env.reset(seed=seed)
         self._config, self._parameters = nominal, parameters
-        self.model = load_model("cassie/cassie.xml", config.physics, visual=True)
+        self.model = load_model(self._envs[False].task.asset, config.physics, visual=True)
         self._data = mujoco.MjData(self.model)
         self._falls = 0
         self._episode = self._begin(randomized)

@@ -1,0 +1,50 @@
+"""`hasrl PROGRAM ...`: one program with sub-commands, the same as `python -m hasrl_jax.PROGRAM ...`."""
+
+import difflib
+import importlib
+import os
+import sys
+
+# name -> (module with `main(arguments) -> exit status`, one line of help); modules load only when they are run
+PROGRAMS = {
+    "train": ("hasrl_jax.cli.train", "train a policy, or continue a run"),
+    "evaluate": ("hasrl_jax.cli.evaluate", "play a policy and measure it; a whole scorecard with --scorecard"),
+    "render": ("hasrl_jax.cli.render", "film a policy"),
+    "viewer": ("hasrl_jax.cli.viewer", "watch and steer a policy in the browser or in MuJoCo's window"),
+    "export": ("hasrl_jax.cli.export", "write the policy of a run to one file"),
+    "figures": ("hasrl_jax.cli.figures", "curves of runs: learning curve, the paper's figures 3 and 4"),
+    "pictures": ("hasrl_jax.cli.pictures", "how a policy walks: contacts, reward terms"),
+    "bench": ("hasrl_jax.cli.bench", "timed figures: collector, learner, scaling, peers, parity"),
+    "doctor": ("hasrl_jax.cli.doctor", "what this machine has and lacks"),
+}
+
+
+def run(program: str, arguments: list[str]) -> int:
+    """Runs a program; returns its exit status."""
+    status: int = importlib.import_module(PROGRAMS[program][0]).main(arguments)
+    return status
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    argv = sys.argv[1:] if argv is None else argv
+    sys.path.insert(0, os.getcwd())  # as `python -m` does: a task may lie in the working directory
+    if argv in (["--version"], ["-V"]):
+        print(importlib.import_module("hasrl_jax").__version__)
+        return 0
+    if not argv or argv[0] in ("-h", "--help"):
+        print("usage: hasrl PROGRAM ...\n\nprograms:")
+        for name, (_, text) in PROGRAMS.items():
+            print(f"  {name:10s} {text}")
+        print("\nhasrl PROGRAM --help tells the options of one.")
+        return 0
+    if argv[0] not in PROGRAMS:
+        closest = difflib.get_close_matches(argv[0], PROGRAMS, n=1)
+        hint = f"did you mean {closest[0]}?" if closest else f"expected one of {', '.join(PROGRAMS)}"
+        print(f"error: got {argv[0]!r}; {hint}", file=sys.stderr)
+        return 2
+    return run(argv[0], argv[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
