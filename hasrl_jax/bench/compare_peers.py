@@ -21,12 +21,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from hasrl_jax.collect.supervisor import ONE_THREAD
 from hasrl_jax.collect.worker import die_with_parent, reply
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registration import ENVIRONMENTS
 from hasrl_jax.errors import WorkerError
+from hasrl_jax.policy.blas import ONE_THREAD
 
 START_TIMEOUT_S = 180.0  # importing torch on a slow disk, then one process per environment
 Iterate = Callable[[], tuple[float, float]]  # one iteration: seconds of collecting, seconds of all of it

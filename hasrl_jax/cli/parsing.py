@@ -61,7 +61,7 @@ def override(base: Config, arguments: list[str], program: str) -> Config:
             values["stages"] = strict_yaml.parse(stages.stages)
         except ValueError as error:
             raise ConfigError(f"--stages: {error}") from None
-    config: Config = from_dict(values)  # as strict as YAML: only finite numbers
+    config = from_dict(values)  # as strict as YAML: only finite numbers
     check(config)
     return config
 

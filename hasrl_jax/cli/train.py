@@ -44,11 +44,9 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool, str | None]:
         if known.task not in (None, base.task):
             raise ConfigError(f"--task: got {known.task}; {known.resume} is a run of task {base.task}")
     elif known.config:
-        base = load_yaml(known.config)
+        base = load_yaml(known.config, known.task)
     else:
         base = recipe(known.task or Config().task)
-    if known.task:
-        base = from_dict({"task": known.task}, base)
     config = override(base, rest, "train")
     curriculum.resolve(config)  # refuses stages that cannot work
     if known.resume:

@@ -26,10 +26,9 @@ from hasrl_jax.config.convert import to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import WorkerError
-from hasrl_jax.policy import numpy_networks as numpy_policy
+from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
 
 log = logging.getLogger("hasrl_jax")
-ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")}
 MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in between
 
 
@@ -222,7 +221,7 @@ class CpuPool:
             [sys.executable, "-m", "hasrl_jax.collect.worker", *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
-            env=numpy_policy.blas_variables() | os.environ | ONE_THREAD,
+            env=blas_variables() | os.environ | ONE_THREAD,
         )
         theirs.close()
         setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}

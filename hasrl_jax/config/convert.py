@@ -28,7 +28,7 @@ def _plain(value: Any) -> Any:
     return [_plain(x) for x in value] if isinstance(value, tuple | list) else value
 
 
-def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
+def from_dict(values: Any, base: Config | None = None, where: str = "config") -> Config:
     """`base` (default: that of the task that `values` name) with the fields named in `values` replaced.
 
     Where `values` name another task than `base` is for, its settings begin at their defaults.
@@ -36,10 +36,14 @@ def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
     Raises:
       ConfigError: an unknown key or a value of another type; the message names the dotted path.
     """
-    if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected a mapping of fields, got {shown(values)}")
-    if base is None or isinstance(base, Config):
-        base = _of_task(base, values.get("task"), where)
+    _require_mapping(values, where)
+    config: Config = _replaced(_of_task(base, values.get("task"), where), values, where)
+    return config
+
+
+def _replaced(base: Any, values: Any, where: str) -> Any:
+    """A configuration, or a group of one, with the fields named in `values` replaced."""
+    _require_mapping(values, where)
     hints = typing.get_type_hints(type(base), include_extras=True)
     known = [f.name for f in dataclasses.fields(base)]
     changes = {}
@@ -48,10 +52,14 @@ def from_dict(values: Any, base: Any = None, where: str = "config") -> Any:
         if key not in known:
             raise ConfigError(f"{path}: unknown field; known fields are {', '.join(known)}")
         current = getattr(base, key)
-        changes[key] = (
-            from_dict(value, current, path) if dataclasses.is_dataclass(current) else _convert(value, hints[key], path)
-        )
+        is_group = dataclasses.is_dataclass(current)
+        changes[key] = _replaced(current, value, path) if is_group else _convert(value, hints[key], path)
     return dataclasses.replace(base, **changes)
+
+
+def _require_mapping(values: Any, where: str) -> None:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: expected a mapping of fields, got {shown(values)}")
 
 
 def _of_task(base: Config | None, task: Any, where: str) -> Config:
@@ -83,7 +91,7 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
             raise ConfigError(f"{path}: got {shown(value)}; expected a mapping of names")
         return {key: x if args[1] is Any else _convert(x, args[1], f"{path}.{key}") for key, x in value.items()}
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        return from_dict(value, hint(), path)
+        return _replaced(hint(), value, path)
     return _scalar(value, hint, path)
 
 

@@ -25,17 +25,19 @@ def _config_folder() -> Path:
 CONFIG_FOLDER = _config_folder()
 
 
-def load_yaml(source: str | Path) -> Config:
+def load_yaml(source: str | Path, task: str | None = None) -> Config:
     """Reads a YAML file over the defaults.
 
     Args:
       source: a file, or the name of one in `configs/`, without its ending.
+      task: takes the place of the task that the file names.
 
     Raises:
       ConfigError: missing or unreadable file, invalid YAML, a key given twice, unknown fields or wrong types.
     """
     path = _resolve(source, Path())
-    return from_dict(_values(path, ()), where=path.name)
+    values = _values(path, ())
+    return from_dict(values | {"task": task} if task else values, where=path.name)
 
 
 def shipped(name: str) -> Config:
@@ -49,7 +51,7 @@ def recipe(task: str) -> Config:
     Raises:
       ConfigError: there is no such task.
     """
-    return from_dict({"task": task}, load_yaml(tasks.find(task).recipe))
+    return load_yaml(tasks.find(task).recipe, task)
 
 
 def dump_yaml(config: Config) -> str:
@@ -75,8 +77,10 @@ def _values(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         values = strict_yaml.parse(text)
     except ValueError as error:
         raise ConfigError(f"--config {path}: {error}") from None
+    if values is None:
+        return {}
     if not isinstance(values, dict):
-        return {} if values is None else from_dict(values, where=path.name)  # which refuses it
+        raise ConfigError(f"{path.name}: expected a mapping of fields, got {shown(values)}")
     if EXTENDS not in values:
         return values
     parent = values.pop(EXTENDS)

@@ -128,7 +128,7 @@ class MjxEngine:
         """The physics steps of one environment step under constant control [nu]; also the overflow flags [2]."""
         task, model = self.task, _with_fields(self.model, state.model_fields)
 
-        def advance_and_sum(carry: tuple, _: None) -> tuple[tuple, None]:
+        def advance_and_sum(carry: tuple[mjx.Data, Array], _: None) -> tuple[tuple[mjx.Data, Array], None]:
             data, total = carry
             data = physics_step(model, data, self.loops)
             return (self._keep(data), total + task.physics_features(data.sensordata, jnp)), None

@@ -16,7 +16,7 @@ import numpy as np
 from hasrl_jax.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional Warp is missing
-    from mujoco import mjx
+    from mujoco import mjx as mjx
 
 
 class Loops(NamedTuple):

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.collect.supervisor import ONE_THREAD
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
@@ -25,6 +24,7 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
 from hasrl_jax.evaluate.page import percent, write_page
 from hasrl_jax.evaluate.rollout import columns, mean_interval, run_episodes, settled_speeds, share_interval
+from hasrl_jax.policy.blas import ONE_THREAD
 from hasrl_jax.policy.numpy_networks import Parameters
 
 log = logging.getLogger("hasrl_jax")

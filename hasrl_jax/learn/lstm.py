@@ -89,7 +89,7 @@ def _recurrence_forward(
     return (outputs, last_h, last_c), (recurrent_kernel, keep, *saved)
 
 
-def _recurrence_backward(residuals: tuple[Any, ...], cotangents: tuple[jax.Array, jax.Array, jax.Array]) -> tuple:
+def _recurrence_backward(residuals: tuple[Any, ...], cotangents: tuple[jax.Array, ...]) -> tuple[Any, ...]:
     """Back-propagation through time: the gradient of every gate, then one product for the recurrent matrix."""
     recurrent_kernel, keep, h_before, c_before, activated = residuals
     d_outputs, d_last_h, d_last_c = cotangents

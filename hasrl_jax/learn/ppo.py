@@ -20,14 +20,13 @@ from hasrl_jax.learn.batching import minibatch_indices
 from hasrl_jax.learn.losses import (
     Batch,
     Metrics,
-    Parameters,
     correct_for_lag,
     policy_lag,
     policy_loss,
     prepare_batch,
     value_loss,
 )
-from hasrl_jax.learn.networks import Policy, Value, make_networks
+from hasrl_jax.learn.networks import Parameters, Policy, Value, make_networks
 from hasrl_jax.types import Mirror, Trajectory
 
 log = logging.getLogger("hasrl_jax")
@@ -200,7 +199,7 @@ class Update:
         rows, size = batch.target.shape[0], ppo.minibatch_trajectories
         indices = jnp.concatenate([minibatch_indices(epoch_key, rows, size) for epoch_key in epoch_keys])
 
-        def minibatch_step(carry: tuple, index: jax.Array) -> tuple[tuple, tuple[Metrics, Metrics]]:
+        def minibatch_step(carry: Any, index: jax.Array) -> tuple[Any, tuple[Metrics, Metrics]]:
             policy, value, active = carry
             rows = jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x[index], self._split), batch)
             policy, active, policy_metrics = jax.lax.cond(

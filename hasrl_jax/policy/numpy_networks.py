@@ -32,18 +32,6 @@ def parameter_shapes(observation_size: int, action_size: int, network: NetworkCo
     return shapes
 
 
-def blas_variables() -> dict[str, str]:
-    """Environment variables with which a process that acts should start; they must be set before it loads NumPy.
-
-    OpenBLAS takes a CPU that is newer than itself for one without AVX-512, at half the speed. NumPy asks the CPU: what
-    it has chosen, and not what it was built with, says whether AVX-512 is there. Where it is not, the variable would
-    kill the process at its first matrix product.
-    """
-    functions = np.lib.introspect.opt_func_info(func_name="tanh", signature="float32")
-    chosen = {found["current"] for signatures in functions.values() for found in signatures.values()}
-    return {"OPENBLAS_CORETYPE": "SkylakeX"} if chosen & {"X86_V4", "AVX512_SKX"} else {}
-
-
 def streams(observation: np.ndarray, parameters: Parameters, mirror: Mirror | None) -> np.ndarray:
     """Normalised network inputs, [S, E, O]: the observation and, for a symmetric network, its mirror image."""
     inputs = [observation] if mirror is None else [observation, mirror.observation(observation)]

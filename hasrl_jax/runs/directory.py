@@ -91,7 +91,7 @@ def load_run_config(run_dir: Path) -> Config:
         cut = f"{LAST} is missing" if missing else "the last line is cut short"
         raise RunError(f"{path}: damaged, or written by another version: {cut}")
     try:
-        config: Config = from_dict(upgraded(values), where=CONFIG_FILE)
+        config = from_dict(upgraded(values), where=CONFIG_FILE)
         check(config)
     except ConfigError as error:
         raise RunError(f"{path}: damaged, or written by another version: {error}") from None

@@ -12,6 +12,7 @@ from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import distributions, ppo
 from hasrl_jax.learn.networks import Policy, make_networks
+from hasrl_jax.policy import blas
 from hasrl_jax.policy import numpy_networks as numpy_policy
 
 
@@ -71,7 +72,7 @@ def test_parameter_shapes_are_those_of_the_learner(make_config):
 
 def test_a_worker_multiplies_matrices_with_its_variables():
     code = "import numpy as np; a = np.ones((64, 64), np.float32); print((a @ a).sum())"
-    environment = {**os.environ, **numpy_policy.blas_variables()}
+    environment = {**os.environ, **blas.blas_variables()}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout.strip()) == (0, "262144.0")
 
@@ -80,4 +81,4 @@ def test_a_worker_multiplies_matrices_with_its_variables():
 def test_only_a_cpu_with_avx_512_is_taken_for_one(monkeypatch, current, set_):
     found = {"tanh": {"ff": {"current": current, "available": "X86_V4 X86_V3 AVX512_SKX baseline(X86_V2)"}}}
     monkeypatch.setattr(np.lib.introspect, "opt_func_info", lambda **_: found)
-    assert ("OPENBLAS_CORETYPE" in numpy_policy.blas_variables()) == set_
+    assert ("OPENBLAS_CORETYPE" in blas.blas_variables()) == set_

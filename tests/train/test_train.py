@@ -35,7 +35,15 @@ total_env_steps: 512
 METRICS = {
     *("iteration", "env_steps", "episode_return_train", "eval_return", "episode_length_train"),
     *("eval_length", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction"),
-    *("explained_variance", "policy_lag", "env_steps_per_second", "collect_seconds", "update_seconds", "test_seconds"),
+    *(
+        "explained_variance",
+        "policy_lag",
+        "env_steps_per_second",
+        "collect_seconds",
+        "update_seconds",
+        "eval_seconds",
+        "stage",
+    ),
     *("reward/foot_force", "reward/action_change", "diverged_envs", "workers_lost"),
 }
 

@@ -10,10 +10,9 @@ import threading
 import warnings
 from typing import Any
 
-from hasrl_jax.collect.supervisor import ONE_THREAD
 from hasrl_jax.config.schema import RayConfig
 from hasrl_jax.errors import ConfigError, WorkerError
-from hasrl_jax.policy.numpy_networks import blas_variables
+from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
 
 ANSWER_TIMEOUT_S = 10.0
 SPARE_BYTES = 2**27  # of the object store, beyond the data of two iterations
