@@ -168,9 +168,3 @@ class Config:
     def settings(self) -> Any:
         """The task's own settings; None where it has none."""
         return getattr(self, self.section) if self.section else None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Its class is made for the task, so pickle cannot find it by name.
-        from hasrl_jax.config import convert
-
-        return convert.from_dict, (convert.to_dict(self),)

@@ -56,7 +56,17 @@ def config_class(task: str) -> type[Config]:
     if spec.settings is None:
         return Config
     group = (spec.name, spec.settings, dataclasses.field(default_factory=spec.settings))
-    return dataclasses.make_dataclass("Config", [group], bases=(Config,), namespace={"section": spec.name}, frozen=True)
+    namespace = {"section": spec.name, "__reduce__": _reduced}
+    return dataclasses.make_dataclass("Config", [group], bases=(Config,), namespace=namespace, frozen=True)
+
+
+def _reduced(config: Config) -> tuple[Any, ...]:
+    """For pickle, which cannot find by name a class that was made for a task."""
+    return _restored, (config.task, {field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+
+
+def _restored(task: str, fields: dict[str, Any]) -> Config:
+    return config_class(task)(**fields)
 
 
 def offered() -> list[str]:

@@ -1,6 +1,8 @@
 """What a configuration refuses, from YAML and from the command line, and what the shipped files state."""
 
+import copy
 import dataclasses
+import pickle
 import typing
 from collections.abc import Iterator
 
@@ -182,3 +184,9 @@ def test_from_dict_refuses_numbers_that_are_not_finite():
     for wrong in (float("nan"), float("inf"), 10**400, "nan"):
         with pytest.raises(ConfigError, match=r"config\.ppo\.clip: got .*; expected a finite number"):
             from_dict({"ppo": {"clip": wrong}})
+
+
+def test_a_configuration_goes_through_pickle_and_copy():
+    stages = [{"at_env_steps": 9, "set": {"ppo.clip": 0.1}}]
+    config = from_dict({"seed": 5, "cassie": {"push": {"force_n": [0, 10]}}, "stages": stages})
+    assert pickle.loads(pickle.dumps(config)) == copy.deepcopy(config) == config
