@@ -1,0 +1,89 @@
+"""The documents name files, functions and settings that exist."""
+
+import ast
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+import hasrl_jax
+from hasrl_jax.config.convert import from_dict
+
+PACKAGE = Path(hasrl_jax.__file__).parent
+ROOT = PACKAGE.parent
+DOCUMENTS = ("docs/architecture.md", "docs/paper_to_code.md", "CONTRIBUTING.md", "README.md")
+FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")
+NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
+PLACES = (ROOT, PACKAGE, ROOT / "docs", ROOT / "tests")
+
+
+def _spans(text: str) -> list[str]:
+    """What stands between backticks, outside code blocks."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+
+
+def _find(name: str) -> Path | None:
+    return next((place / name for place in PLACES if (place / name).exists()), None)
+
+
+def _definitions(path: Path) -> set[str]:
+    """Names that a Python file defines, those inside its classes too; for any other file, its words."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        return set(re.findall(r"\w+", text))
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Name | ast.arg):
+            found.add(node.id if isinstance(node, ast.Name) else node.arg)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.add(node.value)
+    return found
+
+
+def _is_setting(name: str) -> bool:
+    value = from_dict({})
+    for part in name.split("."):
+        if not dataclasses.is_dataclass(value) or not hasattr(value, part):
+            return False
+        value = getattr(value, part)
+    return True
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_every_file_named_exists(document: str) -> None:
+    missing = [span for span in _spans((ROOT / document).read_text()) if FILE.fullmatch(span) and not _find(span)]
+    assert not missing
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_every_link_leads_somewhere(document: str) -> None:
+    text = (ROOT / document).read_text()
+    targets = [target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text)]
+    folder = (ROOT / document).parent
+    missing = [t for t in targets if t and not t.startswith(("http", "mailto")) and not (folder / t).exists()]
+    assert not missing
+
+
+def test_every_function_that_the_paper_leads_to_is_in_the_file_named_beside_it() -> None:
+    for line in (ROOT / "docs/paper_to_code.md").read_text().splitlines():
+        for cell in line.split("|"):
+            files = [path for span in _spans(cell) if FILE.fullmatch(span) and (path := _find(span))]
+            known = set().union(*map(_definitions, files)) if files else set()
+            for span in _spans(cell):
+                if not files or FILE.fullmatch(span) or not NAME.fullmatch(span) or _is_setting(span):
+                    continue
+                assert set(span.split(".")) <= known, f"`{span}` in: {cell.strip()}"
+
+
+def test_every_setting_named_exists() -> None:
+    groups = {
+        field.name for field in dataclasses.fields(from_dict({})) if dataclasses.is_dataclass(field.default_factory)
+    }
+    for document in DOCUMENTS:
+        for span in _spans((ROOT / document).read_text()):
+            name = span.partition(":")[0].strip()
+            if re.fullmatch(r"[a-z]+(\.[a-z_0-9]+)+", name) and name.split(".")[0] in groups | {"cassie"}:
+                assert _is_setting(name), f"{document}: `{span}`"
