@@ -121,11 +121,11 @@ def connect(part: Part) -> Collector:
     Raises:
       ConfigError: the settings do not fit together, or this machine.
     """
-    config, task, update = part
-    networks = Networks(*make_networks(config.network, *sizes(task)))
-    collector = make_collector(config, task, update.mesh, networks)
+    config, task, _ = part
+    mesh, networks = ppo.make_mesh(), Networks(*make_networks(config.network, *sizes(task)))
+    collector = make_collector(config, task, mesh, networks)
     if config.distributed.num_processes > 1:
-        return distributed.SharedExperience(config, collector, update.mesh)
+        return distributed.SharedExperience(config, collector, mesh)
     return collector
 
 
