@@ -17,12 +17,10 @@ type:
 test:
 	$(BIN)/python -m pytest
 
-bench:  ## timed figures, JSON beside the tables
-	$(BIN)/python -m hasrl_jax.bench collector --json bench_collector.json
-	$(BIN)/python -m hasrl_jax.bench scaling --json bench_scaling.json
-	$(BIN)/python -m hasrl_jax.bench learner --json bench_learner.json
-	$(BIN)/python -m hasrl_jax.bench mjx --json bench_mjx.json
-	$(BIN)/python -m hasrl_jax.bench parity --json bench_parity.json
+bench:  ## timed figures on an idle machine, and the tables of docs/ from them
+	for name in collector scaling learner mjx parity; do \
+		$(BIN)/python -m hasrl_jax.bench $$name --json benchmarks/results/$$name.json || exit 1; done
+	$(BIN)/python -m hasrl_jax.bench docs
 
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Protocol
 
+from hasrl_jax.bench.documents import refresh
 from hasrl_jax.bench.report import claim_file, describe_machine
 from hasrl_jax.cli.parsing import run as run_command
 
@@ -54,12 +55,22 @@ def main(argv: list[str] | None = None) -> int:
         subparser.add_argument("--json", type=Path, default=None, metavar="FILE", help="where to write the figures")
         if name in argv[:1]:
             importlib.import_module(module).add_arguments(subparser)
+    documents = "write the tables of docs/*.md anew from benchmarks/results/*.json"
+    subparsers.add_parser("docs", help=documents, description=documents)
     arguments = parser.parse_args(argv)
-    return run_command(lambda: run(arguments))
+    if arguments.name == "docs":
+        return run_command(write_documents)
+    return run_command(lambda: run(arguments, " ".join(["python -m hasrl_jax.bench", *argv])))
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Measures, prints and writes."""
+def write_documents() -> None:
+    """`bench docs`, in the checkout that is the working directory."""
+    for path in refresh(Path("docs"), Path("benchmarks/results")):
+        print(f"{path}: tables written anew")
+
+
+def run(arguments: argparse.Namespace, command: str) -> None:
+    """Measures, prints and writes. `command`: what was typed, for the report."""
     bench: Bench = importlib.import_module(BENCHES[arguments.name][0])  # type: ignore[assignment]
     if arguments.json:
         claim_file(arguments.json)
@@ -70,6 +81,6 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"\n{machine['cores']} cores ({machine['cpu']}), load {machine['load_average']:.1f} at the start")
     print(f"JAX device: {machine['device']}")
     if arguments.json:
-        report = {"bench": arguments.name, **machine, "figures": figures}
+        report = {"bench": arguments.name, "command": command, **machine, "figures": figures}
         arguments.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         print(f"written to {arguments.json}")

@@ -132,6 +132,6 @@ def test_default_numbers_are_powers_of_two(monkeypatch: pytest.MonkeyPatch) -> N
     assert list(mjx.numbers([64, 8, 64])) == [8, 64]
 
 
-def test_tables_line_up() -> None:
+def test_tables_are_markdown_and_line_up() -> None:
     table = report.format_table(["name", "steps/s"], [["a", 12345.6], ["long", 0.1234]])
-    assert table.splitlines()[2:] == ["a      12,346", "long    0.123"]
+    assert table.splitlines()[1:] == ["| ---- | ------: |", "| a    |  12,346 |", "| long |   0.123 |"]
