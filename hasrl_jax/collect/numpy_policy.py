@@ -35,10 +35,13 @@ def parameter_shapes(observation_size: int, action_size: int, network: NetworkCo
 def blas_variables() -> dict[str, str]:
     """Environment variables with which a process that acts should start; they must be set before it loads NumPy.
 
-    OpenBLAS takes a CPU that is newer than itself for one without AVX-512, at half the speed; NumPy asks the CPU.
+    OpenBLAS takes a CPU that is newer than itself for one without AVX-512, at half the speed. NumPy asks the CPU: what
+    it has chosen, and not what it was built with, says whether AVX-512 is there. Where it is not, the variable would
+    kill the process at its first matrix product.
     """
-    found = str(np.lib.introspect.opt_func_info(func_name="tanh", signature="float32"))
-    return {"OPENBLAS_CORETYPE": "SkylakeX"} if "X86_V4" in found or "AVX512_SKX" in found else {}
+    functions = np.lib.introspect.opt_func_info(func_name="tanh", signature="float32")
+    chosen = {found["current"] for signatures in functions.values() for found in signatures.values()}
+    return {"OPENBLAS_CORETYPE": "SkylakeX"} if chosen & {"X86_V4", "AVX512_SKX"} else {}
 
 
 def streams(observation: np.ndarray, parameters: Parameters, mirror: Mirror | None) -> np.ndarray:
