@@ -9,9 +9,22 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class CommandConfig:
+    # world: speeds along the axes of the world, facing x, as in the paper; heading: along and across a heading that
+    # turns by a commanded yaw rate, with the pelvis height as a command too
+    frame: Literal["world", "heading"] = "world"
     forward_m_s: tuple[float, float] = (-0.3, 2.0)  # range of the commanded forward speed, m/s
     lateral_m_s: tuple[float, float] = (-0.1, 0.1)  # range of the commanded lateral speed, m/s (left is positive)
+    yaw_rate_rad_s: tuple[float, float] = (0.0, 0.0)  # heading: range of the commanded turning rate, rad/s (left)
+    height_m: tuple[float, float] = (0.9, 0.9)  # heading: range of the commanded pelvis height above the ground, m
     stand_probability: float = 0.1  # share of draws that command zero speed
+    straight_probability: float = 0.0  # heading: share of draws with a forward speed alone
+    alone_probability: float = 0.0  # heading: share of draws that turn, or walk sideways, on the spot
+    height_probability: float = 1.0  # heading: share of draws with a height of their own; the others have the usual one
+    turn_m_s2: float = 2.0  # heading: bound of |forward speed * yaw rate| in a draw, m/s^2
+    height_fade_m_s: tuple[float, float] = (1.5, 3.0)  # heading: between these speeds drawn heights shrink to the usual
+    start_heading_rad: float = 0.0  # heading: half width of the heading that an episode starts with, rad
+    max_heading_error_rad: float = 0.5  # heading: the heading to keep waits for a robot that is further off it, rad
+    max_drift_m: float = 0.5  # heading: as does the path to keep, m
     start_moving: float = 0.0  # share of episodes that start at the commanded speed instead of at rest
     resample_s: tuple[float, float] = (2.0, 6.0)  # seconds between draws; (0, 0) keeps one draw per episode
 
@@ -23,6 +36,7 @@ class ClockConfig:
     swing_fraction: float = 0.30  # share of each half cycle that is swing, at zero speed
     swing_fraction_per_speed: float = 0.40 / 3  # change of that share per m/s
     max_swing_fraction: float = 0.90  # upper bound of that share
+    stand_below_m_s: float = 0.5  # heading: commanded to stand and slower than this, the clock rests, m/s
 
 
 @dataclass(frozen=True)
@@ -38,7 +52,11 @@ class RewardConfig:
     action_change: float = 0.025  # w8, weight of exp(-A_p)
     velocity_sharpness: float = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
     lateral_velocity_share: float = 1.0  # weight of the lateral speed error in E_v (the paper: 0)
-    height_m: float = 0.9  # pelvis height above the ground that P_m asks for, m
+    heading_share: float = 1.0  # heading: weight of the heading error (rad) in E_v
+    height_m: float = 0.9  # usual pelvis height above the ground, which P_m asks for unless another is commanded, m
+    height_sharpness: float = 1.0  # factor on the height error in P_m
+    height_band_m: float = 0.05  # height error that P_m forgives at zero speed, m
+    height_band_per_speed: float = 0.05  # and that it forgives besides per m/s of commanded speed, m
     shaking: float = 0.25  # factor on summed |angular velocity| and |acceleration| of the pelvis in P_m
     follow_lateral_command: bool = True  # P_m counts drift from the commanded path (the paper: from y = 0)
 

@@ -9,6 +9,7 @@ from typing import Any
 from hasrl_jax.cassie_config import ClockConfig
 from hasrl_jax.types import Array
 
+STAND_FORCE_CLOCK = 0.5  # of both feet while the clock rests: both planted score as one does in single stance
 EDGE = 0.10  # each interval is shortened at both ends by this share of its own length
 
 
