@@ -32,7 +32,8 @@ class CommandConfig:
 @dataclass(frozen=True)
 class ClockConfig:
     cycle_s: float = 0.9  # gait cycle at zero speed, s
-    cycle_per_speed_s: float = -0.25 / 3  # change of the cycle per m/s of commanded speed, s
+    cycle_per_speed_s: float = -0.25 / 3  # change of the cycle per m/s of commanded speed above the next, s
+    quicken_above_m_s: float = 0.0  # commanded speed up to which the cycle stays as it is, m/s
     swing_fraction: float = 0.30  # share of each half cycle that is swing, at zero speed
     swing_fraction_per_speed: float = 0.40 / 3  # change of that share per m/s
     max_swing_fraction: float = 0.90  # upper bound of that share

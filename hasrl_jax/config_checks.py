@@ -30,6 +30,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "cassie.command.resample_s": (0, 1e6),
     "cassie.clock.cycle_s": (0.1, 10),
     "cassie.clock.cycle_per_speed_s": (-10, 10),
+    "cassie.clock.quicken_above_m_s": (0, 10),
     "cassie.clock.swing_fraction": (0.05, 0.95),
     "cassie.clock.swing_fraction_per_speed": (-10, 10),
     "cassie.clock.max_swing_fraction": (0.05, 0.95),
@@ -145,8 +146,9 @@ def check_number(name: str, field: str, value: Any) -> None:
 def _check_cassie(cassie: CassieConfig) -> None:
     """What must fit together among the settings of the walking task."""
     fastest = max(abs(speed) for speed in cassie.command.forward_m_s)
+    above = max(fastest - cassie.clock.quicken_above_m_s, 0.0)
     _require(
-        cassie.clock.cycle_s + cassie.clock.cycle_per_speed_s * fastest > 0.1,
+        cassie.clock.cycle_s + cassie.clock.cycle_per_speed_s * above > 0.1,
         "cassie.clock.cycle_per_speed_s",
         cassie.clock.cycle_per_speed_s,
         f"a gait cycle above 0.1 s at {fastest:g} m/s",
