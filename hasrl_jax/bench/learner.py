@@ -12,7 +12,7 @@ from hasrl_jax.bench.report import format_table
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cassie import task as cassie
+from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.networks import zero_carry
 from hasrl_jax.types import Trajectory
@@ -49,10 +49,11 @@ def sizes(name: str) -> tuple[Config, int, int]:
 
 def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
     """Compiles, warms up, and times single updates on the same random trajectories."""
-    shapes = (cassie.OBSERVATION_SIZE, cassie.ACTION_SIZE, cassie.mirror())
+    task = make_task(config)
+    shapes = task.observation_size, task.action_size, task.mirror
     learner = ppo.init_learner(config, *shapes, jax.random.key(config.seed))
     update = ppo.make_update(config, *shapes, ppo.make_mesh())
-    trajectory = random_trajectory(config, rows, steps)
+    trajectory = random_trajectory(config, rows, steps, *shapes[:2])
     seconds = []
     for _ in range(updates + 2):
         started = time.perf_counter()
@@ -75,7 +76,7 @@ def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
     }
 
 
-def random_trajectory(config: Config, rows: int, steps: int) -> Trajectory:
+def random_trajectory(config: Config, rows: int, steps: int, observation_size: int, action_size: int) -> Trajectory:
     """Full trajectories of noise, each cut by the time limit at its end."""
     rng = np.random.default_rng(config.seed)
 
@@ -84,10 +85,10 @@ def random_trajectory(config: Config, rows: int, steps: int) -> Trajectory:
 
     first, last = np.zeros((2, rows, steps), bool)
     first[:, 0], last[:, -1] = True, True
-    action = noise(steps, cassie.ACTION_SIZE)
+    action = noise(steps, action_size)
     log_prob = -0.5 * np.sum(action**2 + np.log(2 * np.pi), axis=-1, dtype=np.float32)
     return Trajectory(
-        observation=noise(steps, cassie.OBSERVATION_SIZE),
+        observation=noise(steps, observation_size),
         action=action,
         log_prob=log_prob.astype(np.float32),
         value=noise(steps),

@@ -11,11 +11,13 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from hasrl_jax.config.checks import check
+from hasrl_jax.config.checks import check, limits_of
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import recipe
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import task as cassie
+from hasrl_jax.envs.cassie.commands import COMMANDS, completed
+from hasrl_jax.envs.cassie.settings import CommandConfig
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
@@ -40,16 +42,39 @@ def make(task: str = "cassie", config: Config | None = None, **arguments: Any) -
     return TaskEnv(recipe(task) if config is None else from_dict({"task": task}, config), **arguments)
 
 
-def fixed_command(config: Config, forward: float | None = None, lateral: float | None = None) -> Config:
-    """`config` with Cassie's commanded speeds (m/s) held at the given values; None leaves a speed to be drawn."""
-    if forward is None and lateral is None:
+def fixed_command(
+    config: Config,
+    forward: float | None = None,
+    lateral: float | None = None,
+    yaw_rate: float | None = None,
+    height: float | None = None,
+) -> Config:
+    """`config` with Cassie's commands (m/s, rad/s, m) held at the given values; None leaves one to be drawn.
+
+    Raises:
+      ConfigError: a command that the robot does not take in the frame of `config`.
+    """
+    told = {"forward": forward, "lateral": lateral, "yaw_rate": yaw_rate, "height": height}
+    held = {name: value for name, value in told.items() if value is not None}
+    if not held:
         return config
-    command: dict[str, Any] = {"stand_probability": 0.0}
-    if forward is not None:
-        command["forward_m_s"] = [forward, forward]
-    if lateral is not None:
-        command["lateral_m_s"] = [lateral, lateral]
-    if forward is not None and lateral is not None:
+    if not hasattr(config.settings, "command"):
+        raise ConfigError(f"command: task {config.task!r} takes no command")
+    settings = config.settings.command
+    known = {entry.name: entry.field for entry in COMMANDS[settings.frame]}
+    for name in held:
+        if name not in known:
+            raise ConfigError(f"{name}: cassie.command.frame {settings.frame} has {', '.join(known)}")
+    command: dict[str, Any] = dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0)
+    command |= {known[name]: [value, value] for name, value in held.items()}
+    if yaw_rate is not None:
+        command["turn_m_s2"] = limits_of(CommandConfig, "turn_m_s2").high
+    if height is not None:
+        command |= {
+            "height_probability": 1.0,
+            "height_fade_m_s": [limits_of(CommandConfig, "height_fade_m_s").high] * 2,
+        }
+    if len(held) == len(known):
         command["resample_s"] = [0.0, 0.0]
     return from_dict({"cassie": {"command": command}}, config)
 
@@ -107,10 +132,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
           seed: seeds the random stream; None goes on with it.
-          options: `{"command": (forward, lateral)}` holds Cassie's commanded speeds, m/s, for this episode.
+          options: `{"command": (forward, lateral)}` holds Cassie's commanded speeds, m/s, for this episode; in the
+            heading frame a yaw rate (rad/s) and a height (m) may follow.
 
         Raises:
-          ValueError: an unknown option, or a command that is not two finite numbers.
+          ValueError: an unknown option, or a command that is not so many finite numbers.
         """
         super().reset(seed=seed)
         config = self._config_for(options or {})
@@ -193,8 +219,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         physics[0, velocity : velocity + 2] += np.array([forward_n_s, lateral_n_s]) / mass
         self._state = self._state._replace(physics=physics)
 
-    def set_command(self, forward_m_s: float, lateral_m_s: float) -> np.ndarray:
+    def set_command(self, forward_m_s: float, lateral_m_s: float, *more: float) -> np.ndarray:
         """Commands Cassie these speeds from now to the end of the episode.
+
+        Args:
+          forward_m_s: forward speed.
+          lateral_m_s: lateral speed, left is positive.
+          *more: in the heading frame the yaw rate, rad/s, and the height, m; 0 and the usual one without.
 
         Returns:
           The observation to act on: the last one, with the new command.
@@ -203,11 +234,14 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           ConfigError: speeds that are not finite or out of limits, or a task without commands.
           RuntimeError: no episode is running.
         """
-        self._commanded((forward_m_s, lateral_m_s))
+        told = (forward_m_s, lateral_m_s, *more)
+        self._commanded(told)
         if self._state is None or self._ended:
             raise RuntimeError("no episode is running: call reset() first")
-        command = np.array([[forward_m_s, lateral_m_s]], np.float64)
-        task_state, observation = cassie.with_command(self._state.task, self._state.observation, command, np)
+        cassie_config = self.config.settings
+        command = np.array([completed(told, cassie_config.command, cassie_config.reward.height_m)], np.float64)
+        before = self._state.task, self._state.observation
+        task_state, observation = cassie.with_command(cassie_config, *before, command, np)
         self._state = self._state._replace(task=task_state, observation=observation)
         self._observation = observation[0].astype(np.float32)
         return self._observation.copy()
@@ -235,14 +269,17 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"options: unknown {sorted(unknown)}; known is 'command'")
         return self._commanded(options["command"]) if "command" in options else self.config
 
-    def _commanded(self, speeds: Any) -> Config:
-        """The configuration that holds the commanded speeds at these two, checked."""
+    def _commanded(self, told: Any) -> Config:
+        """The configuration that holds the command at these numbers, checked."""
         if self.task.name != "cassie":
             raise ConfigError(f"command: task {self.task.name!r} takes no command")
-        command = np.asarray(speeds, np.float64)
-        if command.shape != (2,) or not np.isfinite(command).all():
-            raise ConfigError(f"command: got {speeds!r}; expected two finite speeds in m/s")
-        config = fixed_command(self.config, *command.tolist())
+        command, cassie_config = np.asarray(told, np.float64), self.config.settings
+        most = len(COMMANDS[cassie_config.command.frame])
+        if command.ndim != 1 or not 2 <= len(command) <= most or not np.isfinite(command).all():
+            more = "" if most == 2 else ", which a yaw rate in rad/s and a height in m may follow"
+            raise ConfigError(f"command: got {told!r}; expected two finite speeds in m/s{more}")
+        whole = completed(command.tolist(), cassie_config.command, cassie_config.reward.height_m)
+        config = fixed_command(self.config, *whole)
         check(config)
         return config
 

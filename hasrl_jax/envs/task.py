@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 
+from hasrl_jax.envs.layout import Entry, size
 from hasrl_jax.types import Array, Mirror
 
 
@@ -54,7 +55,7 @@ class Task:
     ground: Callable[[mujoco.MjSpec], None] | None  # puts ground that changes by episode into a copy of the model
     model: mujoco.MjModel  # without visual shapes
     steps_per_env_step: int  # physics steps per environment step
-    observation_size: int
+    observation: tuple[Entry, ...]  # what the policy sees, in order
     action_size: int
     reset_uniforms: int  # uniform [0, 1) numbers that `reset` consumes
     step_uniforms: int  # uniform [0, 1) numbers that `step` consumes
@@ -66,6 +67,11 @@ class Task:
     force: Callable[[Any, Any], Array] | None  # (state, xp) -> force from outside on each qvel [..., nv]
     physics_features: Callable[[Array, Any], Array]  # (sensordata [..., ns], xp) -> [..., F]
     step: Callable[[Any, Array, Reading, Array, Any], Transition]  # (state, action, reading, uniforms, xp)
+
+    @property
+    def observation_size(self) -> int:
+        """O: numbers that the policy sees."""
+        return size(self.observation)
 
     @property
     def env_step_s(self) -> float:

@@ -11,6 +11,8 @@ from hasrl_jax.config.compat import upgraded
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs import layout
+from hasrl_jax.envs.layout import Entry
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.learn import normalize, ppo
@@ -90,7 +92,44 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
         its, ours = getattr(trained.network, name), getattr(config.network, name)
         if its != ours:
             raise ConfigError(f"network.{name}: got {ours}; --init-policy {source} needs --network.{name} {its}")
-    return parameters
+    return _for_observation(parameters, make_task(trained).observation, make_task(config).observation, source)
+
+
+def _for_observation(
+    parameters: dict[str, np.ndarray], its: tuple[Entry, ...], ours: tuple[Entry, ...], source: str
+) -> dict[str, np.ndarray]:
+    """`parameters` of a policy that sees `its` quantities, for one that sees `ours`: those that are new have no effect.
+
+    Raises:
+      ConfigError: it sees a quantity that we do not.
+    """
+    if its == ours:
+        return parameters
+    known, wanted = layout.places(its), {entry.name: entry for entry in ours}
+    for entry in its:
+        if entry.name not in wanted or wanted[entry.name].size != entry.size:
+            raise ConfigError(
+                f"--init-policy {source}: it sees {entry.name} ({entry.size}); this run's policies do not"
+            )
+
+    def rows(array: np.ndarray, fill: str | None) -> np.ndarray:
+        """`array` [O of its, ...] as [O of ours, ...]; new rows hold an attribute of their entry, or zeros."""
+        parts = [
+            array[known[entry.name]]
+            if entry.name in known
+            else np.full((entry.size, *array.shape[1:]), getattr(entry, fill) if fill else 0.0, array.dtype)
+            for entry in ours
+        ]
+        return np.concatenate(parts)
+
+    fills = {
+        "policy/lstm_0_input": None,
+        "value/dense_0_kernel": None,
+        "normalizer/mean": "mean",
+        "normalizer/std": "std",
+    }
+    changed = {name: rows(parameters[name], fill) for name, fill in fills.items() if name in parameters}
+    return parameters | changed
 
 
 def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]) -> ppo.LearnerState:

@@ -23,6 +23,7 @@ import numpy as np
 
 from hasrl_jax.config.limits import Limits
 from hasrl_jax.config.tasks import TaskSpec
+from hasrl_jax.envs.layout import SAME, Entry
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reset, Task, Transition
 
@@ -54,7 +55,7 @@ def make(config):
         ground=None,
         model=load_model(HERE / "slider.xml", config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
-        observation_size=1,
+        observation=(Entry("position", "m", SAME),),
         action_size=1,
         reset_uniforms=1,
         step_uniforms=0,

@@ -17,6 +17,9 @@ PASSIVE = ("shin", "tarsus", "foot")
 NOMINAL_ROBOT = {"randomize": {"enabled": False}}
 
 
+HEADING = {"frame": "heading", "yaw_rate_rad_s": [-1.0, 1.0], "height_m": [0.65, 1.0], "start_heading_rad": 3.0}
+
+
 def _make(**changes: dict) -> tuple[Task, cassie.Constants]:
     task = cassie.make(from_dict({"cassie": changes}))
     return task, task.step.args[0]
@@ -175,17 +178,20 @@ def _mirror_task_state(task: Task, state: cassie.CassieState) -> cassie.CassieSt
     encoder = np.concatenate([task.mirror.action(motors), passive[:, [3, 4, 5, 0, 1, 2]]], axis=1)
     return state._replace(
         phase=np.mod(state.phase + 0.5, 1.0),
-        command=state.command * [1, -1],
-        path_y=-state.path_y,
+        command=state.command * [1, -1, -1, 1][: state.command.shape[1]],
+        path=state.path * [1, -1],
+        target_heading=-state.target_heading,
         encoder_offset=encoder,
         action=task.mirror.action(state.action),
         torque=task.mirror.action(state.torque),
     )
 
 
+@pytest.mark.parametrize("frame", ["world", "heading"])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_mirror_image_of_a_step_is_the_step_of_the_mirror_image(seed: int) -> None:
-    task, envs, state, action = _moving_state(16, seed, command={"resample_s": [0, 0]}, **NOMINAL_ROBOT)
+def test_the_mirror_image_of_a_step_is_the_step_of_the_mirror_image(seed: int, frame: str) -> None:
+    command = {"resample_s": [0, 0]} | (HEADING if frame == "heading" else {})
+    task, envs, state, action = _moving_state(16, seed, command=command, **NOMINAL_ROBOT)
     offset = np.random.default_rng(seed).uniform(-0.01, 0.01, (1, 16))
     state = state._replace(task=state.task._replace(encoder_offset=offset))
     mirrored = state._replace(
@@ -203,8 +209,9 @@ def test_the_mirror_image_of_a_step_is_the_step_of_the_mirror_image(seed: int) -
 
 
 def test_mirroring_twice_changes_nothing() -> None:
-    mirror = cassie.mirror()
-    observation, action = np.arange(1.0, 51), np.arange(1.0, 11)
+    task, _ = _make(command=HEADING)
+    mirror = task.mirror
+    observation, action = np.arange(1.0, 53), np.arange(1.0, 11)
     np.testing.assert_array_equal(mirror.observation(mirror.observation(observation)), observation)
     np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
     np.testing.assert_array_equal(mirror.action(cassie.NEUTRAL_RAD), cassie.NEUTRAL_RAD)
@@ -227,7 +234,7 @@ def test_commands_are_drawn_again_when_due() -> None:
 def test_command_draws() -> None:
     settings = from_dict({}).cassie.command
     uniforms = np.random.default_rng(0).random((2000, 4))
-    command, seconds = commands.draw_command(uniforms, settings, np)
+    command, seconds = commands.draw_command(uniforms, settings, 0.9, np)
     standing = (command == 0).all(axis=1)
     assert 0.07 < standing.mean() < 0.13
     low, high = settings.forward_m_s
@@ -237,7 +244,7 @@ def test_command_draws() -> None:
     assert seconds.min() >= 2
     assert seconds.max() < 6
     once = from_dict({"cassie": {"command": {"resample_s": [0, 0]}}}).cassie.command
-    assert np.isinf(commands.draw_command(uniforms, once, np)[1]).all()  # one command per episode
+    assert np.isinf(commands.draw_command(uniforms, once, 0.9, np)[1]).all()  # one command per episode
 
 
 def test_path_follows_the_commanded_lateral_speed() -> None:
@@ -245,8 +252,8 @@ def test_path_follows_the_commanded_lateral_speed() -> None:
     fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
     state = fresh.state._replace(command=np.array([[0.5, 0.08]]), command_s=np.array([99.0]))
     for _ in range(4):
-        state = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 4)), np).state
-    np.testing.assert_allclose(state.path_y, 4 * 0.025 * 0.08)
+        state = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 7)), np).state
+    np.testing.assert_allclose(state.path, [[4 * 0.025 * 0.5, 4 * 0.025 * 0.08]])
 
 
 @pytest.mark.parametrize(
@@ -266,7 +273,7 @@ def test_each_cause_of_termination(height: float, roll_deg: float, pitch_deg: fl
     qpos = fresh.qpos.copy()
     half = np.deg2rad([roll_deg, pitch_deg]) / 2
     qpos[0, 2:7] = height, np.cos(half.sum()), np.sin(half[0]), np.sin(half[1]), 0
-    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 4)), np)
+    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 7)), np)
     assert bool(result.terminated[0]) is expected
 
 
@@ -275,7 +282,7 @@ def test_yaw_alone_never_terminates_and_is_reported() -> None:
     fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
     qpos = fresh.qpos.copy()
     qpos[0, 3:7] = np.cos(1.0), 0, 0, np.sin(1.0)
-    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 4)), np)
+    result = task.step(fresh.state, np.zeros((1, 10)), _still_reading(task, qpos), np.zeros((1, 7)), np)
     assert not result.terminated[0]
     assert result.measures[0, task.measures.index("heading")] == pytest.approx(2.0)
 
@@ -302,12 +309,13 @@ def test_the_clock_advances_by_one_environment_step() -> None:
     task, _ = _make()
     fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
     state = fresh.state._replace(phase=np.array([0.99]), command=np.array([[0.0, 0.0]]))
-    result = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 4)), np)
+    result = task.step(state, np.zeros((1, 10)), _still_reading(task, fresh.qpos), np.zeros((1, 7)), np)
     np.testing.assert_allclose(result.state.phase, 0.99 + 0.025 / 0.9 - 1)
 
 
-def test_numpy_equals_jax() -> None:
-    task, envs, state, action = _moving_state()
+@pytest.mark.parametrize("command", [{}, HEADING])
+def test_numpy_equals_jax(command: dict) -> None:
+    task, envs, state, action = _moving_state(command=command)
     _, reading, _ = envs._simulate(state, task.control(state.task, action, np))
     rng = np.random.default_rng(5)
     reset_uniforms, uniforms = rng.random((1, task.reset_uniforms)), rng.random((1, task.step_uniforms))

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import hasrl_jax  # noqa: F401 (importing it registers the environments)
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
-from hasrl_jax.envs.gymnasium import TaskEnv, make
+from hasrl_jax.envs.gymnasium import TaskEnv, fixed_command, make
 from hasrl_jax.envs.registration import ENVIRONMENTS
 from hasrl_jax.errors import ConfigError
 
@@ -96,6 +96,25 @@ def test_a_command_can_change_within_an_episode() -> None:
         ours, theirs = again.step(np.zeros(10)), fixed.step(np.zeros(10))
         np.testing.assert_array_equal(ours[0], theirs[0])
         assert ours[1] == theirs[1]
+
+
+def test_commands_of_the_heading_frame() -> None:
+    config = from_dict({"cassie": {"command": {"frame": "heading"}, "randomize": {"enabled": False}}})
+    env = make("cassie", config)
+    observation, _ = env.reset(seed=0, options={"command": (3.0, 0.0, 0.9, 0.7)})  # faster turns than any is drawn
+    np.testing.assert_allclose(observation[48:], [3.0, 0.0, 0.9, 0.7], rtol=1e-6)
+    info = env.step(np.zeros(10))[4]
+    assert (info["yaw_rate_command"], info["height_command"]) == (0.9, 0.7)
+    np.testing.assert_allclose(env.set_command(0.5, 0.1)[48:], [0.5, 0.1, 0.0, 0.9], rtol=1e-6)
+    env.reset(seed=0)
+    standing = env.set_command(0.0, 0.0)
+    np.testing.assert_array_equal(standing[46:], [0, 0, 0, 0, 0, np.float32(0.9)])  # the clock rests at once
+    with pytest.raises(ConfigError, match="yaw rate in rad/s and a height"):
+        env.set_command(0.0, 0.0, 0.0, 0.9, 1.0)
+    with pytest.raises(ConfigError, match=r"two finite speeds in m/s$"):
+        make("cassie").reset(options={"command": (0.0, 0.0, 0.5)})
+    with pytest.raises(ConfigError, match=r"yaw_rate: cassie\.command\.frame world has forward, lateral"):
+        fixed_command(from_dict({}), yaw_rate=0.5)
 
 
 def test_impossible_commands_are_refused() -> None:

@@ -109,12 +109,15 @@ def test_the_same_uniforms_give_the_same_robot() -> None:
         np.testing.assert_allclose(getattr(state.task, name), value, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_cassie_agrees_with_c_in_double_precision() -> None:
+@pytest.mark.parametrize("frame", ["world", "heading"])
+def test_cassie_agrees_with_c_in_double_precision(frame: str) -> None:
     """From the same states, actions and draws: to 1e-9 after one environment step, to 1e-4 after three.
 
     The solver stops early in both engines, and contacts amplify the rounding in between.
     """
-    config = from_dict({"cassie": {"push": {"force_n": [50, 200], "interval_s": [0, 0.5]}}})
+    command = {"frame": frame, "start_heading_rad": 2.0, "yaw_rate_rad_s": [-1, 1], "height_m": [0.65, 1.0]}
+    push = {"force_n": [50, 200], "interval_s": [0, 0.5]}
+    config = from_dict({"cassie": {"command": command, "push": push}})
     report = parity.measure(config, num_states=6, horizons=(1, 3), double_precision=True)
     task = make_task(config)
     for horizon, tolerance in (("1", 1e-9), ("3", 1e-4)):

@@ -45,13 +45,13 @@ def test_quaternion_error_is_the_squared_sine_of_half_the_angle() -> None:
 )
 def test_pelvis_motion_bands(lateral: float, height: float, speed: float, expected: float) -> None:
     still = np.zeros(3)
-    value = rewards.pelvis_motion(np.array(lateral), np.array(height), np.array(speed), still, still, PAPER, np)
+    value = rewards.pelvis_motion(np.array(lateral), np.array(height - 0.9), np.array(speed), still, still, PAPER, np)
     assert value == pytest.approx(expected)
 
 
 def test_pelvis_motion_counts_shaking() -> None:
     angular, linear = np.array([1.0, -2.0, 0.5]), np.array([-0.5, 0.0, 4.0])
-    value = rewards.pelvis_motion(np.array(0.0), np.array(0.9), np.array(0.0), angular, linear, PAPER, np)
+    value = rewards.pelvis_motion(np.array(0.0), np.array(0.0), np.array(0.0), angular, linear, PAPER, np)
     assert value == pytest.approx(0.25 * (3.5 + 4.5))
 
 

@@ -17,6 +17,8 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
+from hasrl_jax.policy import numpy_networks as numpy_policy
+from hasrl_jax.runs import checkpoint
 
 
 def test_the_released_policy_walks_at_the_commanded_speed() -> None:
@@ -84,6 +86,39 @@ def test_a_learner_given_a_policy_acts_as_it_does() -> None:
     assert exported.keys() == released.keys()
     for name, array in exported.items():
         np.testing.assert_allclose(array, released[name], rtol=1e-6, err_msg=name)
+
+
+def test_a_policy_goes_on_in_a_task_that_shows_it_more() -> None:
+    """What is new has no effect at first, so the policy that only knows straight ahead also walks in the new task."""
+    config = shipped("cassie_steer")
+    task = make_task(config)
+    released, ours = policies.load_policy_parameters(None, "released")[1], policies.load_initial(config, "released")
+    assert (task.observation_size, len(released["normalizer/mean"])) == (52, 50)
+    for name in ("policy/lstm_0_input", "value/dense_0_kernel"):
+        np.testing.assert_array_equal(ours[name][:50], released[name])
+        assert not ours[name][50:].any()
+    np.testing.assert_allclose(ours["normalizer/mean"][48:], [*released["normalizer/mean"][48:], 0.0, 0.9])
+    np.testing.assert_allclose(ours["normalizer/std"][48:], [*released["normalizer/std"][48:], 0.5, 0.1])
+    shapes = numpy_policy.parameter_shapes(task.observation_size, task.action_size, config.network)
+    assert {name: array.shape for name, array in ours.items()} == shapes
+
+    command = {"forward_m_s": [2.0, 2.0], "lateral_m_s": [0, 0], "yaw_rate_rad_s": [0.4, 0.4], "height_m": [0.9, 0.9]}
+    command |= dict.fromkeys(("stand_probability", "straight_probability", "alone_probability", "start_moving"), 0.0)
+    config = from_dict({"cassie": {"command": command}, "collect": {"max_episode_steps": 240}}, config)
+    task = make_task(config)
+    episodes = evaluate.run_episodes(config, task, ours, episodes=2, seed=0)
+    assert episodes.reached_cap.all()
+    means = evaluate.columns(episodes, task)
+    np.testing.assert_allclose(means["forward_speed"][120:].mean(axis=0), 2.0, atol=0.2)
+    np.testing.assert_allclose(means["yaw_rate"][120:].mean(axis=0), 0.4, atol=0.1)
+
+
+def test_a_policy_that_wants_to_see_more_than_there_is_is_refused(tmp_path: Path) -> None:
+    config = shipped("cassie_steer")
+    path = tmp_path / "steer.npz"
+    checkpoint.save_policy(path, policies.load_initial(config, "released"), policies.policy_metadata(config))
+    with pytest.raises(ConfigError, match=r"it sees yaw_rate_command \(1\); this run's policies do not"):
+        policies.load_initial(shipped("cassie_walk"), str(path))
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs import layout
 from hasrl_jax.envs.draws import between
+from hasrl_jax.envs.layout import NEGATED, Entry
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
-from hasrl_jax.types import Array, Mirror
+from hasrl_jax.types import Array
 
 ASSET = Path(__file__).parent / "cartpole.xml"
+OBSERVATION = (Entry("cart_position", "m", NEGATED), Entry("pole_angle", "rad", NEGATED))
+ACTION = (Entry("push", "", NEGATED),)  # as a share of its limit
 MAX_ANGLE_RAD = 0.2
 MAX_POSITION_M = 1.0
 START = 0.05  # half width of the uniform start position (m), angle (rad) and of their rates
@@ -35,13 +39,13 @@ def make(config: Config) -> Task:
         ground=None,
         model=load_model(ASSET, config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
-        observation_size=2,
+        observation=OBSERVATION,
         action_size=1,
         reset_uniforms=4,
         step_uniforms=0,
         reward_terms=("upright",),
         measures=("angle",),
-        mirror=Mirror(np.arange(2), -np.ones(2, np.float32), np.arange(1), -np.ones(1, np.float32)),
+        mirror=layout.mirror(OBSERVATION, ACTION),
         reset=reset,
         control=control,
         force=None,

@@ -9,12 +9,13 @@ from typing import Any
 from hasrl_jax.envs.cassie.settings import ClockConfig
 from hasrl_jax.types import Array
 
+STAND_FORCE_CLOCK = 0.5  # of both feet while the clock rests: both planted score as one does in single stance
 EDGE = 0.10  # each interval is shortened at both ends by this share of its own length
 
 
 def cycle_seconds(speed: Array, config: ClockConfig, xp: Any) -> Array:
     """Duration of a gait cycle in seconds at commanded speed(s) [...] in m/s."""
-    return config.cycle_s + config.cycle_per_speed_s * xp.abs(speed)
+    return config.cycle_s + config.cycle_per_speed_s * xp.maximum(xp.abs(speed) - config.quicken_above_m_s, 0.0)
 
 
 def swing_fraction(speed: Array, config: ClockConfig, xp: Any) -> Array:

@@ -1,25 +1,90 @@
-"""What an episode draws again and again: commanded speeds, and pushes on the pelvis."""
+"""What an episode draws again and again: commands, and pushes on the pelvis."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hasrl_jax.envs.cassie.settings import CommandConfig, PushConfig
 from hasrl_jax.envs.draws import between
+from hasrl_jax.envs.layout import NEGATED, SAME, Entry
 from hasrl_jax.types import Array
 
-COMMAND_UNIFORMS = 4  # forward, lateral, stand or not, time until the next draw
 PUSH_UNIFORMS = 3  # force, direction, time until the push
 
 
-def draw_command(uniforms: Array, config: CommandConfig, xp: Any) -> tuple[Array, Array]:
-    """Uniform numbers [..., 4] to a command [..., 2] in m/s and the seconds until the next draw [...]."""
+class Command(NamedTuple):
+    """One thing that a robot can be told."""
+
+    name: str
+    field: str  # of `CommandConfig`: its range
+    entry: Entry  # how it stands in the observation
+
+
+FORWARD = Command("forward", "forward_m_s", Entry("forward_command", "m/s", SAME))
+LATERAL = Command("lateral", "lateral_m_s", Entry("lateral_command", "m/s", NEGATED))
+YAW_RATE = Command("yaw_rate", "yaw_rate_rad_s", Entry("yaw_rate_command", "rad/s", NEGATED, std=0.5))
+HEIGHT = Command("height", "height_m", Entry("height_command", "m", SAME, mean=0.9, std=0.1))
+# In the order of the numbers in a command.
+COMMANDS = {"world": (FORWARD, LATERAL), "heading": (FORWARD, LATERAL, YAW_RATE, HEIGHT)}
+
+
+def num_uniforms(config: CommandConfig) -> int:
+    """Uniform numbers that a draw consumes: one per command, which kind, whether a height, and the time it holds."""
+    return {"world": 4, "heading": 7}[config.frame]
+
+
+def named(command: Array, config: CommandConfig) -> dict[str, Array]:
+    """The numbers of a command [..., C] by name, each [...]."""
+    return {entry.name: command[..., index] for index, entry in enumerate(COMMANDS[config.frame])}
+
+
+def completed(told: Sequence[float], config: CommandConfig, usual_height_m: float) -> list[float]:
+    """A whole command from its first numbers: the others are no speed and the usual height."""
+    rest = [usual_height_m if command is HEIGHT else 0.0 for command in COMMANDS[config.frame]]
+    return [*told, *rest[len(told) :]]
+
+
+def draw_command(uniforms: Array, config: CommandConfig, usual_height_m: float, xp: Any) -> tuple[Array, Array]:
+    """Uniform numbers [..., num_uniforms] to a command [..., C] and the seconds until the next draw [...]."""
+    draw = _draw_in_world if config.frame == "world" else _draw_in_heading
+    seconds = between(uniforms[..., -1], config.resample_s)
+    return draw(uniforms, config, usual_height_m, xp), xp.where(seconds > 0, seconds, xp.inf)
+
+
+def _draw_in_world(uniforms: Array, config: CommandConfig, _: float, xp: Any) -> Array:
+    """Both speeds, or none: [..., 2]."""
     forward = between(uniforms[..., 0], config.forward_m_s)
     lateral = between(uniforms[..., 1], config.lateral_m_s)
     stand = uniforms[..., 2:3] < config.stand_probability
-    command = xp.where(stand, 0.0, xp.stack([forward, lateral], axis=-1))
-    seconds = between(uniforms[..., 3], config.resample_s)
-    return command, xp.where(seconds > 0, seconds, xp.inf)
+    return xp.where(stand, 0.0, xp.stack([forward, lateral], axis=-1))
+
+
+def _draw_in_heading(uniforms: Array, config: CommandConfig, usual_height_m: float, xp: Any) -> Array:
+    """A stand, a straight walk, a turn or side-steps on the spot, or all at once: [..., 4].
+
+    Who is fast turns slowly and keeps the usual height.
+    """
+    forward, lateral, yaw_rate, height = (
+        between(uniforms[..., index], getattr(config, command.field))
+        for index, command in enumerate(COMMANDS["heading"])
+    )
+    kind, has_height = uniforms[..., 4], uniforms[..., 5] < config.height_probability
+    shares = config.stand_probability, config.straight_probability, *2 * [config.alone_probability / 2]
+    stand_end, straight_end, turn_end, side_end = np.cumsum(shares)
+    on_spot = (kind < stand_end) | ((kind >= straight_end) & (kind < side_end))
+    forward = xp.where(on_spot, 0.0, forward)
+    lateral = xp.where(kind < turn_end, 0.0, lateral)
+    yaw_rate = xp.where((kind < straight_end) | ((kind >= turn_end) & (kind < side_end)), 0.0, yaw_rate)
+    speed = xp.abs(forward)
+    # At least 0.01 m/s, or a division by zero; so slowly the bound never matters.
+    fastest_turn = config.turn_m_s2 / xp.maximum(speed, 0.01)
+    widest = max(abs(end) for end in config.yaw_rate_rad_s)
+    yaw_rate = yaw_rate * xp.minimum(1.0, fastest_turn / max(widest, 1e-6))
+    low, high = config.height_fade_m_s
+    share = xp.clip((high - speed) / max(high - low, 1e-6), 0.0, 1.0) * has_height
+    height = usual_height_m + share * (height - usual_height_m)
+    return xp.stack([forward, lateral, yaw_rate, height], axis=-1)
 
 
 def draw_push(uniforms: Array, config: PushConfig, xp: Any) -> tuple[Array, Array]:

@@ -24,13 +24,14 @@ TERMS = (
     "action_change",
 )
 MAX_FOOT_FORCE_N = 350.0
+STAND_FOOT_FORCE_N = 120.0  # a foot under less than half of the robot's 320 N counts as planted
 MAX_FOOT_SPEED_M_S = 2.0
 CLOCK_GAIN = 1.2
 # World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
 NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
 
 
-def clock_score(clock: Array, magnitude: Array, limit: float, xp: Any) -> Array:
+def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -> Array:
     """S_F and S_V: sum over the feet of tan(pi/4 * 1.2 * clock * min(|x|, limit) / limit).
 
     Args:
@@ -46,9 +47,34 @@ def quaternion_error(quat: Array, reference: Array) -> Array:
     return 1.0 - (quat * reference).sum(axis=-1) ** 2
 
 
+def turned_quaternion_error(products: Array, angle: Array, xp: Any) -> Array:
+    """`quaternion_error` from `reference` turned by `angle` about the vertical, from `turn_products` or their mean.
+
+        <q_z(angle) reference, q>^2 = cos^2(angle/2) A + 2 cos(angle/2) sin(angle/2) B + sin^2(angle/2) C
+
+    so that a mean over physics steps is exact for an angle that is known only after them.
+
+    Args:
+      products: [..., n, 3] A, B and C.
+      angle: rad, [...].
+
+    Returns:
+      [..., n].
+    """
+    cos, sin = xp.cos(angle / 2), xp.sin(angle / 2)
+    return 1.0 - (products * xp.stack([cos**2, 2 * cos * sin, sin**2], axis=-1)[..., None, :]).sum(axis=-1)
+
+
+def turn_products(quat: Array, reference: np.ndarray, xp: Any) -> Array:
+    """A = a^2, B = a b and C = b^2, [..., 4] -> [..., 3]: a = <reference, quat>, b = <k reference, quat>."""
+    w, x, y, z = reference
+    a, b = (quat * reference).sum(axis=-1), (quat * np.array([-z, -y, x, w])).sum(axis=-1)
+    return xp.stack([a * a, a * b, b * b], axis=-1)
+
+
 def pelvis_motion(
     lateral_m: Array,
-    height_m: Array,
+    height_error_m: Array,
     speed: Array,
     angular_velocity: Array,
     acceleration: Array,
@@ -59,15 +85,16 @@ def pelvis_motion(
 
     Args:
       lateral_m: sideways drift of the pelvis, m, [...].
-      height_m: pelvis height, m, [...].
+      height_error_m: pelvis height less the one asked for, m, [...].
       speed: commanded forward speed, m/s, [...].
       angular_velocity: of the pelvis, rad/s, [..., 3].
       acceleration: of the pelvis, gravity removed, m/s^2, [..., 3].
     """
     drift = xp.abs(lateral_m)
     drift = xp.where(drift < 0.05, 0.0, drift)
-    height_error = xp.abs(height_m - config.height_m)
-    height_error = xp.where(height_error < 0.05 + 0.05 * xp.abs(speed), 0.0, height_error)
+    height_error = xp.abs(height_error_m)
+    band = config.height_band_m + config.height_band_per_speed * xp.abs(speed)
+    height_error = config.height_sharpness * xp.where(height_error < band, 0.0, height_error)
     shaking = xp.abs(angular_velocity).sum(axis=-1) + xp.abs(acceleration).sum(axis=-1)
     return drift + height_error + config.shaking * shaking
 

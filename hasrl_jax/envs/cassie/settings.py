@@ -11,10 +11,28 @@ from hasrl_jax.config.limits import Limits, Range, Share
 
 @dataclass(frozen=True)
 class CommandConfig:
+    # world: speeds along the axes of the world, facing x, as in the paper; heading: along and across a heading that
+    # turns by a commanded yaw rate, with the pelvis height as a command too
+    frame: Literal["world", "heading"] = "world"
     forward_m_s: Annotated[Range, Limits(-10, 10)] = (-0.3, 2.0)  # range of the commanded forward speed, m/s
     # range of the commanded lateral speed, m/s (left is positive)
     lateral_m_s: Annotated[Range, Limits(-10, 10)] = (-0.1, 0.1)
+    # heading: range of the commanded turning rate, rad/s (left)
+    yaw_rate_rad_s: Annotated[Range, Limits(-10, 10)] = (0.0, 0.0)
+    # heading: range of the commanded pelvis height above the ground, m
+    height_m: Annotated[Range, Limits(0.1, 2)] = (0.9, 0.9)
     stand_probability: Share = 0.1  # share of draws that command zero speed
+    straight_probability: Share = 0.0  # heading: share of draws with a forward speed alone
+    alone_probability: Share = 0.0  # heading: share of draws that turn, or walk sideways, on the spot
+    height_probability: Share = 1.0  # heading: share of draws with a height of their own; the others have the usual one
+    turn_m_s2: Annotated[float, Limits(0, 100)] = 2.0  # heading: bound of |forward speed * yaw rate| in a draw, m/s^2
+    # heading: between these speeds drawn heights shrink to the usual
+    height_fade_m_s: Annotated[Range, Limits(0, 100)] = (1.5, 3.0)
+    # heading: half width of the heading that an episode starts with, rad
+    start_heading_rad: Annotated[float, Limits(0, 3.1416)] = 0.0
+    # heading: the heading to keep waits for a robot that is further off it, rad
+    max_heading_error_rad: Annotated[float, Limits(0.01, 3.1416)] = 0.5
+    max_drift_m: Annotated[float, Limits(0.01, 1e6)] = 0.5  # heading: as does the path to keep, m
     start_moving: Share = 0.0  # share of episodes that start at the commanded speed instead of at rest
     # seconds between draws; (0, 0) keeps one draw per episode
     resample_s: Annotated[Range, Limits(0, 1e6)] = (2.0, 6.0)
@@ -23,11 +41,15 @@ class CommandConfig:
 @dataclass(frozen=True)
 class ClockConfig:
     cycle_s: Annotated[float, Limits(0.1, 10)] = 0.9  # gait cycle at zero speed, s
-    # change of the cycle per m/s of commanded speed, s
+    # change of the cycle per m/s of commanded speed above the next, s
     cycle_per_speed_s: Annotated[float, Limits(-10, 10)] = -0.25 / 3
+    # commanded speed up to which the cycle stays as it is, m/s
+    quicken_above_m_s: Annotated[float, Limits(0, 10)] = 0.0
     swing_fraction: Annotated[float, Limits(0.05, 0.95)] = 0.30  # share of each half cycle that is swing, at zero speed
     swing_fraction_per_speed: Annotated[float, Limits(-10, 10)] = 0.40 / 3  # change of that share per m/s
     max_swing_fraction: Annotated[float, Limits(0.05, 0.95)] = 0.90  # upper bound of that share
+    # heading: commanded to stand and slower than this, the clock rests, m/s
+    stand_below_m_s: Annotated[float, Limits(0, 10)] = 0.5
 
 
 @dataclass(frozen=True)
@@ -44,7 +66,13 @@ class RewardConfig:
     velocity_sharpness: Annotated[float, Limits(0, 1e3)] = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
     # weight of the lateral speed error in E_v (the paper: 0)
     lateral_velocity_share: Annotated[float, Limits(0, 1e3)] = 1.0
-    height_m: Annotated[float, Limits(0, 2)] = 0.9  # pelvis height above the ground that P_m asks for, m
+    heading_share: Annotated[float, Limits(0, 1e3)] = 1.0  # heading: weight of the heading error (rad) in E_v
+    # usual pelvis height above the ground, which P_m asks for unless another is commanded, m
+    height_m: Annotated[float, Limits(0, 2)] = 0.9
+    height_sharpness: Annotated[float, Limits(0, 1e3)] = 1.0  # factor on the height error in P_m
+    height_band_m: Annotated[float, Limits(0, 2)] = 0.05  # height error that P_m forgives at zero speed, m
+    # and that it forgives besides per m/s of commanded speed, m
+    height_band_per_speed: Annotated[float, Limits(0, 2)] = 0.05
     # factor on summed |angular velocity| and |acceleration| of the pelvis in P_m
     shaking: Annotated[float, Limits(0, 1e3)] = 0.25
     follow_lateral_command: bool = True  # P_m counts drift from the commanded path (the paper: from y = 0)

@@ -18,8 +18,9 @@ def check(config: Config) -> None:
     """
     settings: CassieConfig = config.settings
     fastest = max(abs(speed) for speed in settings.command.forward_m_s)
+    above = max(fastest - settings.clock.quicken_above_m_s, 0.0)
     require(
-        settings.clock.cycle_s + settings.clock.cycle_per_speed_s * fastest > 0.1,
+        settings.clock.cycle_s + settings.clock.cycle_per_speed_s * above > 0.1,
         "cassie.clock.cycle_per_speed_s",
         settings.clock.cycle_per_speed_s,
         f"a gait cycle above 0.1 s at {fastest:g} m/s",

@@ -1,4 +1,4 @@
-"""The Cassie walking task: 50 observations, 10 PD targets, the clock reward.
+"""The Cassie walking task: 50 observations (52 in the heading frame), 10 PD targets, the clock reward.
 
 Source: paper section II.A to II.D; constants of the published implementation.
 """
@@ -11,28 +11,52 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs import frames, layout
 from hasrl_jax.envs.cassie import clock, commands, randomize, rewards, terrain
 from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.envs.draws import between
+from hasrl_jax.envs.layout import AXIAL, NEGATED, QUATERNION, SAME, VECTOR, Entry
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
-from hasrl_jax.types import Array, Mirror
+from hasrl_jax.types import Array
 
 ASSET = Path(__file__).parent / "cassie.xml"
-OBSERVATION_SIZE = 50
-ACTION_SIZE = 10
-NUM_ENCODERS = 16  # ten motors, six passive joints
+# Of both legs, left leg first; a mirror changes the sign of what rolls and yaws.
+_MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS) * 2
+_PASSIVE_SIGNS = SAME * (2 * len(PASSIVE_JOINTS))
+# What the policy sees, followed by the commands. Source: order of the published implementation, paper section II.A.
+OBSERVATION = (
+    Entry("pelvis_height", "m", SAME),  # above the ground
+    Entry("pelvis_orientation", "", QUATERNION),  # w, x, y, z; in the heading frame relative to the heading to keep
+    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True),
+    Entry("pelvis_velocity", "m/s", VECTOR),  # along the axes of the world, or along the heading to keep
+    Entry("pelvis_angular_velocity", "rad/s", AXIAL),  # pelvis frame
+    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True),
+    Entry("pelvis_acceleration", "m/s^2", VECTOR),  # pelvis frame, gravity removed
+    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True),
+    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True),
+    Entry("clock", "", 2 * NEGATED),  # sin and cos of the phase: half a cycle swaps the feet's clocks
+)
+ACTION = (Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True),)  # relative to NEUTRAL_RAD
+ACTION_SIZE = layout.size(ACTION)
+NUM_ENCODERS = len(_MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # PD targets at zero action: the motor positions of the initial pose, rad. Source: published implementation,
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
 MEASURES = (
-    *("forward_speed", "lateral_speed"),  # of the pelvis at the end of the environment step, m/s
+    *("forward_speed", "lateral_speed"),  # of the pelvis in the command's frame, at the end of the step, m/s
     *("forward_command", "lateral_command"),  # that held during the environment step, m/s
     *("height", "heading"),  # of the pelvis, above the ground, at the end of the environment step, m and rad
     *("left_force", "right_force"),  # ground force on each foot, mean over the physics steps, N
     "motor_power",  # sum of |torque * joint velocity| over the motors, mean over the physics steps, W
     "phase",  # of the gait clock by which the environment step was judged, [0, 1)
+)
+HEADING_MEASURES = (
+    "yaw_rate",  # of the pelvis about the vertical at the end of the environment step, rad/s
+    *("yaw_rate_command", "height_command"),  # those held during the environment step, rad/s and m
+    "heading_error",  # how far the heading is to the left of the one to keep, rad
 )
 
 
@@ -40,9 +64,11 @@ class CassieState(NamedTuple):
     """What the task remembers of an episode; leading axes [...]."""
 
     phase: Array  # [...] gait phase in [0, 1)
-    command: Array  # [..., 2] commanded forward and lateral speed, m/s
+    command: Array  # [..., C] in the order of `commands.COMMANDS`
     command_s: Array  # [...] seconds until the command is drawn again
-    path_y: Array  # [...] where the commanded lateral speed would have led, m
+    path: Array  # [..., 2] a point that moves as commanded, world x and y, m
+    target_heading: Array  # [...] the heading to keep, rad; 0 in the world frame
+    standing: Array  # [...] bool: the clock rests
     push: Array  # [..., 2] force of the next push, world x and y, N
     push_s: Array  # [...] seconds until that push; it acts while this is not positive
     encoder_offset: Array  # [..., 16] of the motors and the passive joints, rad
@@ -78,21 +104,22 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         env_step_s=config.physics.env_step_s,
     )
-    drawn = commands.COMMAND_UNIFORMS + commands.PUSH_UNIFORMS
-    drawn_at_reset = drawn + 2 + NUM_ENCODERS + terrain.num_uniforms(config.settings.terrain)
+    drawn = commands.num_uniforms(config.settings.command) + commands.PUSH_UNIFORMS
+    in_heading = config.settings.command.frame == "heading"
+    drawn_at_reset = drawn + 2 + in_heading + NUM_ENCODERS + terrain.num_uniforms(config.settings.terrain)
     return Task(
         name="cassie",
         asset=ASSET,
         ground=ground,
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
-        observation_size=OBSERVATION_SIZE,
+        observation=observation_entries(config.settings),
         action_size=ACTION_SIZE,
         reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset,
         step_uniforms=drawn,
         reward_terms=rewards.TERMS,
-        measures=MEASURES,
-        mirror=mirror(),
+        measures=MEASURES + (HEADING_MEASURES if in_heading else ()),
+        mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
         control=control,
         force=partial(force, constants) if config.settings.push.force_n[1] > 0 else None,
@@ -101,23 +128,44 @@ def make(config: Config) -> Task:
     )
 
 
+def observation_entries(config: CassieConfig) -> tuple[Entry, ...]:
+    """All that the policy sees, in order."""
+    return (*OBSERVATION, *(command.entry for command in commands.COMMANDS[config.command.frame]))
+
+
 def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
-    sizes = randomize.num_uniforms(nominal), commands.COMMAND_UNIFORMS, commands.PUSH_UNIFORMS, 1, 1, NUM_ENCODERS
-    model_u, command_u, push_u, phase_u, start_u, encoder_u, terrain_u = xp.split(uniforms, np.cumsum(sizes), axis=-1)
+    in_heading = config.command.frame == "heading"
+    drawn = commands.num_uniforms(config.command), commands.PUSH_UNIFORMS
+    sizes = randomize.num_uniforms(nominal), *drawn, 1, 1, int(in_heading), NUM_ENCODERS
+    parts = xp.split(uniforms, np.cumsum(sizes), axis=-1)
+    model_u, command_u, push_u, phase_u, start_u, heading_u, encoder_u, terrain_u = parts
 
     fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
     offset = xp.where(randomize.is_drawn(model_u, config.randomize), config.randomize.encoder_offset_rad, 0.0)
-    command, command_s = commands.draw_command(command_u, config.command, xp)
+    command, command_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.draw_push(push_u, config.push, xp)
+    half = config.command.start_heading_rad
+    yaw = between(heading_u[..., 0], (-half, half)) if in_heading else xp.zeros(batch)
+    qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
+    rates = xp.where(start_u < config.command.start_moving, command, 0.0)
+    velocity, turn = rates[..., :2], xp.zeros((*batch, 4))
+    if in_heading:
+        upright = frames.turned_quaternion(qpos[..., 3:7], yaw, xp)
+        qpos = xp.concatenate([qpos[..., :3], upright, qpos[..., 7:]], axis=-1)
+        velocity, turn = frames.turned(velocity, yaw, xp), xp.concatenate([turn[..., :3], rates[..., 2:3]], axis=-1)
+    rest = xp.zeros((*batch, len(nominal.dof_damping) - 6))
+    qvel = xp.concatenate([velocity, turn, rest], axis=-1)
     state = CassieState(
         phase=phase_u[..., 0],
         command=command,
         command_s=command_s,
-        path_y=xp.zeros(batch),
+        path=xp.zeros((*batch, 2)),
+        target_heading=yaw,
+        standing=is_standing(config, command, velocity, xp),
         push=push,
         push_s=push_s,
         encoder_offset=offset[..., None] * (2 * encoder_u - 1),
@@ -126,9 +174,6 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
     )
-    qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
-    start_velocity = xp.where(start_u < config.command.start_moving, command, 0.0)
-    qvel = xp.concatenate([start_velocity, xp.zeros((*batch, len(nominal.dof_damping) - 2))], axis=-1)
     # Nothing accelerates yet, so the first observation needs no physics.
     observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), xp)
     fields |= terrain.model_fields(terrain_u, constants.model, config.terrain, xp)
@@ -148,13 +193,19 @@ def force(constants: Constants, state: CassieState, xp: Any) -> Array:
 
 
 def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
-    """What is averaged over physics steps, [..., 5]: ground force (N) and orientation error of each foot, motor power.
+    """What is averaged over physics steps: ground force (N) and orientation of each foot, motor power.
 
+    The orientation is the error of each foot, [..., 5] altogether, or in the heading frame `rewards.turn_products` of
+    each, [..., 9].
     The power, sum |torque * joint velocity| in W, is for the measures: read at the end of an environment step, when the
     PD loop has calmed down, it would be up to a fifth too low.
     """
     ids = constants.ids
-    error = rewards.quaternion_error(sensordata[..., ids.foot_orientation], rewards.NEUTRAL_FOOT_QUAT)
+    quat = sensordata[..., ids.foot_orientation]
+    if constants.config.command.frame == "world":
+        error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT)
+    else:
+        error = rewards.turn_products(quat, rewards.NEUTRAL_FOOT_QUAT, xp).reshape((*quat.shape[:-2], 6))
     power = xp.abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]).sum(axis=-1, keepdims=True)
     return xp.concatenate([sensordata[..., ids.foot_force], error, power], axis=-1)
 
@@ -165,32 +216,41 @@ def step(
     """Reward, termination and next observation of the environment step that `reading` ends."""
     config, ids = constants.config, constants.ids
     quat = reading.qpos[..., 3:7]
-    up = up_in_body_frame(quat, xp)
+    up = frames.up_in_body_frame(quat, xp)
     acceleration = reading.sensordata[..., ids.acceleration] - GRAVITY_M_S2 * up
     torque = reading.sensordata[..., ids.torque]
-    path_y = state.path_y + state.command[..., 1] * state.env_step_s
-    errors = reward_errors(constants, state, action, reading, acceleration, path_y, xp)
+    told = commands.named(state.command, config.command)
+    state = follow(constants, state, reading.qpos, xp)
+    errors = reward_errors(constants, state, action, reading, acceleration, xp)
     terms = rewards.weighted_terms(errors, config.reward, xp)
 
     height = height_above_ground(constants, state, reading.qpos, xp)
     limits = config.termination
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
-    posture = xp.stack([height, heading(quat, xp)], axis=-1)
-    gait = [reading.averages[..., :2], reading.averages[..., 4:], state.phase[..., None]]
-    measures = xp.concatenate([reading.qvel[..., :2], state.command, posture, *gait], axis=-1)
+    velocity = pelvis_velocity(constants, state, reading.qvel, xp)
+    yaw = frames.heading(quat, xp)
+    measured = [velocity[..., :2], xp.stack([told["forward"], told["lateral"], height, yaw], axis=-1)]
+    measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
+    if config.command.frame == "heading":
+        yaw_rate = (up * reading.qvel[..., 3:6]).sum(axis=-1)
+        error = frames.wrapped(yaw - state.target_heading, xp)
+        measured.append(xp.stack([yaw_rate, told["yaw_rate"], told["height"], error], axis=-1))
+    measures = xp.concatenate(measured, axis=-1)
 
-    drawn, drawn_s = commands.draw_command(uniforms, config.command, xp)
-    push_u = uniforms[..., commands.COMMAND_UNIFORMS :]
+    command_u, push_u = xp.split(uniforms, [commands.num_uniforms(config.command)], axis=-1)
+    drawn, drawn_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.next_push(state.push, state.push_s, state.env_step_s, push_u, config.push, xp)
     due = state.command_s <= state.env_step_s
-    cycle_s = clock.cycle_seconds(state.command[..., 0], config.clock, xp)
+    cycle_s = clock.cycle_seconds(told["forward"], config.clock, xp)
+    # The clock counts environment steps, as the published one does, not randomised seconds.
+    phase = xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0)
+    command = xp.where(due[..., None], drawn, state.command)
     state = state._replace(
-        # The clock counts environment steps, as the published one does, not randomised seconds.
-        phase=xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0),
-        command=xp.where(due[..., None], drawn, state.command),
+        phase=xp.where(state.standing, state.phase, phase),
+        standing=is_standing(config, command, velocity, xp),
+        command=command,
         command_s=xp.where(due, drawn_s, state.command_s - state.env_step_s),
-        path_y=path_y,
         push=push,
         push_s=push_s,
         action=action,
@@ -201,27 +261,80 @@ def step(
 
 
 def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, xp: Any) -> Array:
-    """The 50 inputs of the policy in the published order, [..., 50]. Source: paper section II.A."""
+    """The inputs of the policy, [..., O], as `observation_entries` lists them."""
     ids, offset = constants.ids, state.encoder_offset
-    parts = [
-        height_above_ground(constants, state, qpos, xp)[..., None],  # of the pelvis, m
-        qpos[..., 3:7],  # its orientation (w, x, y, z)
-        qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
-        qvel[..., 0:6],  # pelvis linear velocity (world frame), angular velocity (pelvis frame)
-        qvel[..., ids.motor_qvel],
-        acceleration,  # of the pelvis (pelvis frame), gravity removed
-        qpos[..., ids.passive_qpos] + offset[..., ACTION_SIZE:],
-        qvel[..., ids.passive_qvel],
-        clock.phase_signal(state.phase, xp),
-        state.command,
-    ]
-    return xp.concatenate(parts, axis=-1)
+    values = {
+        "pelvis_height": height_above_ground(constants, state, qpos, xp)[..., None],
+        "pelvis_orientation": pelvis_orientation(constants, state, qpos, xp),
+        "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
+        "pelvis_velocity": pelvis_velocity(constants, state, qvel, xp),
+        "pelvis_angular_velocity": qvel[..., 3:6],
+        "motor_velocities": qvel[..., ids.motor_qvel],
+        "pelvis_acceleration": acceleration,
+        "passive_positions": qpos[..., ids.passive_qpos] + offset[..., ACTION_SIZE:],
+        "passive_velocities": qvel[..., ids.passive_qvel],
+        "clock": clock_signal(state, xp),
+    }
+    return xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
 
 
-def with_command(state: CassieState, observation: Array, command: Array, xp: Any) -> tuple[CassieState, Array]:
-    """`state` and `observation` [..., 50] under `command` [..., 2] (m/s) until the end of the episode."""
-    state = state._replace(command=command, command_s=xp.full_like(state.command_s, xp.inf))
-    return state, xp.concatenate([observation[..., :-2], command], axis=-1)
+def with_command(
+    config: CassieConfig, state: CassieState, observation: Array, command: Array, xp: Any
+) -> tuple[CassieState, Array]:
+    """`state` and `observation` [..., O] under `command` [..., C] until the end of the episode."""
+    places = layout.places(OBSERVATION)
+    standing = is_standing(config, command, observation[..., places["pelvis_velocity"]], xp)
+    state = state._replace(command=command, command_s=xp.full_like(state.command_s, xp.inf), standing=standing)
+    unchanged = observation[..., : places["clock"].start]
+    return state, xp.concatenate([unchanged, clock_signal(state, xp), command], axis=-1)
+
+
+def clock_signal(state: CassieState, xp: Any) -> Array:
+    """What the policy sees of the clock, [..., 2]: zeros while it rests."""
+    return xp.where(state.standing[..., None], 0.0, clock.phase_signal(state.phase, xp))
+
+
+def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> CassieState:
+    """`state` with the heading and the path to keep moved on by an environment step, which ended in `qpos`.
+
+    In the heading frame both wait for a robot that is too far off them: who is twisted or shoved away has to get its
+    speeds right from there on, not to return.
+    """
+    config, moved = constants.config.command, state.command[..., :2] * state.env_step_s[..., None]
+    if config.frame == "world":
+        return state._replace(path=state.path + moved)
+    told = commands.named(state.command, config)
+    target = state.target_heading + told["yaw_rate"] * state.env_step_s
+    error, limit = frames.wrapped(target - frames.heading(qpos[..., 3:7], xp), xp), config.max_heading_error_rad
+    target = frames.wrapped(target - error + xp.clip(error, -limit, limit), xp)
+    drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
+    drift = xp.stack([xp.zeros_like(target), xp.clip(drift[..., 1], -config.max_drift_m, config.max_drift_m)], axis=-1)
+    return state._replace(path=qpos[..., :2] + frames.turned(drift, target, xp), target_heading=target)
+
+
+def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) -> Array:
+    """Whether the clock rests: commanded to stand, and not much faster than that; [..., C], [..., 2 or 3] -> [...]."""
+    if config.command.frame == "world":
+        return xp.zeros(command.shape[:-1], bool)
+    slow = (velocity[..., :2] ** 2).sum(axis=-1) < config.clock.stand_below_m_s**2
+    return slow & (command[..., :3] == 0).all(axis=-1)
+
+
+def pelvis_orientation(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
+    """Quaternion (w, x, y, z) of the pelvis in the world, or relative to the heading to keep, [..., 4]."""
+    if constants.config.command.frame == "world":
+        return qpos[..., 3:7]
+    return frames.turned_quaternion(qpos[..., 3:7], -state.target_heading, xp)
+
+
+def pelvis_velocity(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> Array:
+    """Linear velocity along the axes of the world, or along the heading to keep, m/s, [..., 3].
+
+    Not along the pelvis's own heading: it sways with every step, which at 4 m/s is 0.3 m/s of apparent lateral speed.
+    """
+    if constants.config.command.frame == "world":
+        return qvel[..., 0:3]
+    return frames.turned(qvel[..., 0:3], -state.target_heading, xp)
 
 
 def reward_errors(
@@ -230,29 +343,43 @@ def reward_errors(
     action: Array,
     reading: Reading,
     acceleration: Array,
-    path_y: Array,
     xp: Any,
 ) -> dict[str, Array]:
     """The scores and errors of paper Table I by term name, each [...]."""
     config, ids = constants.config, constants.ids
     settings = config.reward
-    speed = state.command[..., 0]
+    told = commands.named(state.command, config.command)
+    speed = told["forward"]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
+    standing = state.standing[..., None]
+    force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
+    most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, rewards.MAX_FOOT_FORCE_N)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     height = height_above_ground(constants, state, reading.qpos, xp)
-    drift = reading.qpos[..., 1] - (path_y if settings.follow_lateral_command else 0.0)
-    pelvis_error = 1.0 - reading.qpos[..., 3] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
-    velocity_error = xp.abs(reading.qvel[..., :2] - state.command)
+    orientation = pelvis_orientation(constants, state, reading.qpos, xp)
+    pelvis_error = 1.0 - orientation[..., 0] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
+    velocity = pelvis_velocity(constants, state, reading.qvel, xp)
+    velocity_error = xp.abs(velocity[..., :2] - state.command[..., :2])
+    speed_error = velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]
+    if config.command.frame == "world":
+        drift = reading.qpos[..., 1] - (state.path[..., 1] if settings.follow_lateral_command else 0.0)
+        foot_error, usual_height = reading.averages[..., 2:4], settings.height_m
+    else:
+        target = state.target_heading
+        drift = frames.turned(reading.qpos[..., :2] - state.path, -target, xp)[..., 1]
+        products = reading.averages[..., 2:8].reshape((*target.shape, 2, 3))
+        foot_error, usual_height = rewards.turned_quaternion_error(products, target, xp), told["height"]
+        off = frames.wrapped(frames.heading(reading.qpos[..., 3:7], xp) - target, xp)
+        speed_error = speed_error + settings.heading_share * xp.abs(off)
     torque_change = xp.abs(reading.sensordata[..., ids.torque] - state.torque)
     return {
-        "foot_force": rewards.clock_score(force_clock, reading.averages[..., :2], rewards.MAX_FOOT_FORCE_N, xp),
+        "foot_force": rewards.clock_score(force_clock, reading.averages[..., :2], most_force, xp),
         "foot_velocity": rewards.clock_score(-force_clock, foot_speed, rewards.MAX_FOOT_SPEED_M_S, xp),
-        "orientation": 10 * pelvis_error + 10 * reading.averages[..., 2:4].sum(axis=-1),
+        "orientation": 10 * pelvis_error + 10 * foot_error.sum(axis=-1),
         "pelvis_motion": rewards.pelvis_motion(
-            drift, height, speed, reading.qvel[..., 3:6], acceleration, settings, xp
+            drift, height - usual_height, speed, reading.qvel[..., 3:6], acceleration, settings, xp
         ),
-        "velocity": settings.velocity_sharpness
-        * (velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]),
+        "velocity": settings.velocity_sharpness * speed_error,
         "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
         "torque_change": 0.25 * torque_change.mean(axis=-1),
         "action_change": 5 * xp.abs(action - state.action).mean(axis=-1),
@@ -262,33 +389,3 @@ def reward_errors(
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
     """Height of the pelvis above the ground below it, m, [...]; it jumps where the pelvis passes the edge of a step."""
     return qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, constants.config.terrain, xp)
-
-
-def up_in_body_frame(quat: Array, xp: Any) -> Array:
-    """The world's vertical in the frame that `quat` (w, x, y, z) orients, [..., 4] -> [..., 3]."""
-    w, x, y, z = (quat[..., i] for i in range(4))
-    return xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
-
-
-def heading(quat: Array, xp: Any) -> Array:
-    """Yaw angle in rad, [..., 4] -> [...]."""
-    w, x, y, z = (quat[..., i] for i in range(4))
-    return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def mirror() -> Mirror:
-    """The left-right mirror image (x-z plane) of observations and actions; half a cycle swaps the feet's clocks."""
-    motor_sign = [-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS] * 2
-    passive_sign = [1.0] * (2 * len(PASSIVE_JOINTS))
-
-    def swap(start: int, per_leg: int) -> list[int]:
-        return [*range(start + per_leg, start + 2 * per_leg), *range(start, start + per_leg)]
-
-    motors, passive = len(MOTORS), len(PASSIVE_JOINTS)
-    index = [*range(5), *swap(5, motors), *range(15, 21), *swap(21, motors), 31, 32, 33]
-    index += [*swap(34, passive), *swap(40, passive), 46, 47, 48, 49]
-    vector, axial = [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]  # how mirroring acts on positions and on rotations
-    sign = [1.0, 1.0, *axial, *motor_sign, *vector, *axial, *motor_sign, *vector, *passive_sign, *passive_sign]
-    sign += [-1.0, -1.0, 1.0, -1.0]  # clock sin, cos; forward and lateral command
-    signs = np.array(sign, np.float32), np.array(motor_sign, np.float32)
-    return Mirror(np.array(index), signs[0], np.array(swap(0, motors)), signs[1])
