@@ -124,17 +124,19 @@ def test_a_resumed_run_gives_the_same_numbers(tmp_path, tiny):
 
 
 def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
-    tiny.write_text(TINY + "stages: ['256 ppo.policy_learning_rate=1e-5', '384 ppo.value_learning_rate=1e-5']\n")
+    stages = "[{at_env_steps: 256, set: {ppo.policy_learning_rate: 1e-5}}, {at_env_steps: 384, set: {ppo.clip: 0.1}}]"
+    tiny.write_text(f"{TINY}stages: {stages}\n")
     assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "whole")]) == 0
     assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "parts"), "--total-env-steps", "384"]) == 0
     assert train_main(["--resume", str(tmp_path / "parts"), "--total-env-steps", "512"]) == 0
     whole = untimed(tmp_path / "whole")
     np.testing.assert_allclose([record["learning_rate"] for record in whole], [3e-4, 3e-4, 1e-5, 1e-5], rtol=1e-6)
-    assert without_tests(whole) == without_tests(untimed(tmp_path / "parts"))
+    assert [record["stage"] for record in whole] == [0, 0, 1, 2]
+    assert without_evaluations(whole) == without_evaluations(untimed(tmp_path / "parts"))
 
 
-def without_tests(records: list[dict]) -> list[dict]:
-    return [{name: value for name, value in record.items() if "test" not in name} for record in records]
+def without_evaluations(records: list[dict]) -> list[dict]:
+    return [{name: value for name, value in record.items() if "eval" not in name} for record in records]
 
 
 def test_overlap_acts_with_parameters_one_version_old(tmp_path, tiny):
