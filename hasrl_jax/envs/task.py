@@ -52,26 +52,34 @@ class Task:
 
     name: str
     asset: Path  # MJCF file of the model, for a copy with its visual shapes
-    ground: Callable[[mujoco.MjSpec], None] | None  # puts ground that changes by episode into a copy of the model
     model: mujoco.MjModel  # without visual shapes
     steps_per_env_step: int  # physics steps per environment step
     observation: tuple[Entry, ...]  # what the policy sees, in order
-    action_size: int
-    reset_uniforms: int  # uniform [0, 1) numbers that `reset` consumes
-    step_uniforms: int  # uniform [0, 1) numbers that `step` consumes
+    action: tuple[Entry, ...]  # what it decides, in order
     reward_terms: tuple[str, ...]
-    measures: tuple[str, ...]
-    mirror: Mirror | None
+    reset_uniforms: int  # uniform [0, 1) numbers that `reset` consumes
     reset: Callable[[Array, Any], Reset]  # (uniforms [..., reset_uniforms], xp)
     control: Callable[[Any, Array, Any], Array]  # (state, action [..., A], xp) -> ctrl [..., nu]
-    force: Callable[[Any, Any], Array] | None  # (state, xp) -> force from outside on each qvel [..., nv]
-    physics_features: Callable[[Array, Any], Array]  # (sensordata [..., ns], xp) -> [..., F]
     step: Callable[[Any, Array, Reading, Array, Any], Transition]  # (state, action, reading, uniforms, xp)
+    step_uniforms: int = 0  # uniform [0, 1) numbers that `step` consumes
+    measures: tuple[str, ...] = ()
+    mirror: Mirror | None = None
+    # (sensordata [..., ns], xp) -> [..., F]; nothing is averaged over physics steps by default
+    physics_features: Callable[[Array, Any], Array] = lambda sensordata, xp: sensordata[..., :0]
+    force: Callable[[Any, Any], Array] | None = None  # (state, xp) -> force from outside on each qvel [..., nv]
+    ground: Callable[[mujoco.MjSpec], None] | None = (
+        None  # puts ground that changes by episode into a copy of the model
+    )
 
     @property
     def observation_size(self) -> int:
         """O: numbers that the policy sees."""
         return size(self.observation)
+
+    @property
+    def action_size(self) -> int:
+        """A: numbers that it decides."""
+        return size(self.action)
 
     @property
     def env_step_s(self) -> float:

@@ -52,20 +52,15 @@ def make(config):
     return Task(
         name="slider",
         asset=HERE / "slider.xml",
-        ground=None,
         model=load_model(HERE / "slider.xml", config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=(Entry("position", "m", SAME),),
-        action_size=1,
+        action=(Entry("push", "", SAME),),
         reset_uniforms=1,
-        step_uniforms=0,
         reward_terms=("near",),
         measures=("position",),
-        mirror=None,
         reset=reset,
         control=lambda state, action, xp: xp.clip(action, -1.0, 1.0),
-        force=None,
-        physics_features=lambda sensordata, xp: sensordata[..., :0],
         step=step,
     )
 

@@ -36,20 +36,16 @@ def make(config: Config) -> Task:
     return Task(
         name="cartpole",
         asset=ASSET,
-        ground=None,
         model=load_model(ASSET, config.physics),
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=OBSERVATION,
-        action_size=1,
+        action=ACTION,
         reset_uniforms=4,
-        step_uniforms=0,
         reward_terms=("upright",),
         measures=("angle",),
         mirror=layout.mirror(OBSERVATION, ACTION),
         reset=reset,
         control=control,
-        force=None,
-        physics_features=physics_features,
         step=step,
     )
 
@@ -64,11 +60,6 @@ def reset(uniforms: Array, xp: Any) -> Reset:
 def control(state: CartpoleState, action: Array, xp: Any) -> Array:
     """The push on the cart as a share of its limit, [..., 1]."""
     return xp.clip(action, -1.0, 1.0)
-
-
-def physics_features(sensordata: Array, xp: Any) -> Array:
-    """Nothing is averaged over physics steps: [..., 0]."""
-    return sensordata[..., :0]
 
 
 def step(state: CartpoleState, action: Array, reading: Reading, uniforms: Array, xp: Any) -> Transition:

@@ -114,7 +114,7 @@ def make(config: Config) -> Task:
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=observation_entries(config.settings),
-        action_size=ACTION_SIZE,
+        action=ACTION,
         reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset,
         step_uniforms=drawn,
         reward_terms=rewards.TERMS,
