@@ -209,7 +209,7 @@ def test_a_run_directory_in_use_is_refused(tmp_path, tiny, capsys):
         (["--resume", "missing_run"], "missing_run"),
         (["--resume", "missing_run", "--run-dir", "elsewhere"], "--run-dir"),
         (["--resume", "missing_run", "--run_dir=elsewhere"], "--run-dir"),
-        (["--task", "hopper"], "--task"),
+        (["--task", "hopper"], "task: got 'hopper'"),
         (["--backend=tpu_pool"], "--backend"),
         (["--no-such-field", "1"], "--no-such-field"),
     ],
