@@ -2,7 +2,7 @@
 
 import sys
 
-from hasrl_jax.visualize.curves import main
+from hasrl_jax.cli.figures import main
 
 if __name__ == "__main__":
     sys.exit(main())

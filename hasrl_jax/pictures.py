@@ -2,7 +2,7 @@
 
 import sys
 
-from hasrl_jax.visualize.pictures.__main__ import main
+from hasrl_jax.cli.pictures import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,5 +1,6 @@
 """What the command lines share: dotted overrides of any config field, the checks, and errors on one line."""
 
+import argparse
 import contextlib
 import dataclasses
 import difflib
@@ -21,6 +22,8 @@ from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, HasrlError
+from hasrl_jax.policy.loading import load_policy_parameters, under_reference_physics
+from hasrl_jax.policy.numpy_networks import Parameters
 
 SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
 
@@ -90,6 +93,32 @@ def override_for_policy(trained: Config, arguments: list[str], program: str) -> 
             can = " and ".join(changeable)
             raise ConfigError(f"{name}: a trained policy fixes it; only {can} settings can be overridden")
     return config
+
+
+def to_play(trained: Config, physics: str, overrides: list[str], program: str) -> Config:
+    """The configuration under which a policy is played.
+
+    Args:
+      trained: what it was trained with.
+      physics: "paper", the one its task is judged under, or "training".
+      overrides: options for the physics and the task's settings, which come last.
+      program: for messages.
+
+    Raises:
+      ConfigError: an override that cannot work, or of what a trained policy fixes.
+    """
+    config = trained if physics == "training" else under_reference_physics(trained)
+    return override_for_policy(config, overrides, program)
+
+
+def policy_to_play(known: argparse.Namespace, overrides: list[str], program: str) -> tuple[Config, Parameters]:
+    """The policy that `options.add_policy_options` names, as `to_play` has it: (configuration, parameters).
+
+    Raises:
+      ConfigError: an impossible option; RunError, CheckpointError: no policy.
+    """
+    trained, parameters = load_policy_parameters(known.run_dir, known.policy)
+    return to_play(trained, known.physics, overrides, program), parameters
 
 
 def run(job: Callable[[], None]) -> int:

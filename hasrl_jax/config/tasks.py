@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hasrl_jax.config.limits import shown
-from hasrl_jax.config.schema import Config
+from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.errors import ConfigError
 
 ENTRY_POINTS = "hasrl_jax.tasks"
@@ -29,7 +29,11 @@ class TaskSpec:
     recipe: Path  # the YAML file that trains it when no other is named
     settings: type | None = None  # frozen dataclass of its own settings, with a default for every field
     check: Callable[[Config], None] | None = None  # raises ConfigError for settings that do not fit together
-    undisturbed: Callable[[Config], Config] = lambda config: config  # the nominal robot, disturbed by nobody
+    # What a policy is played under: finer physics than that of the training; by default the same.
+    reference_physics: Callable[[], PhysicsConfig] | None = None
+    # The nominal robot from rest, disturbed by nobody but on request; and robots drawn at random, where there are any.
+    undisturbed: Callable[[Config], Config] = lambda config: config
+    randomized: Callable[[Config], Config] | None = None
 
 
 def find(name: str) -> TaskSpec:

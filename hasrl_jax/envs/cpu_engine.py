@@ -55,9 +55,10 @@ class CpuEnvs:
       task: the definition to run.
       num_envs: E.
       max_episode_steps: time limit in environment steps.
+      pushable: whether `Task.with_push` may be used on a task that is not disturbed by itself.
     """
 
-    def __init__(self, task: Task, num_envs: int, max_episode_steps: int):
+    def __init__(self, task: Task, num_envs: int, max_episode_steps: int, pushable: bool = False):
         # `step` reports a diverged simulation; MuJoCo would also write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
@@ -74,8 +75,9 @@ class CpuEnvs:
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
         self._states = np.empty((num_envs, task.steps_per_env_step, size))
         self._sensordata = np.empty((num_envs, task.steps_per_env_step, task.model.nsensordata))
-        inputs = task.model.nu + (task.model.nv if task.force else 0)
-        self._control_spec = CONTROL | FORCE if task.force else CONTROL
+        self._force = task.force if task.disturbed or pushable else None
+        inputs = task.model.nu + (task.model.nv if self._force else 0)
+        self._control_spec = CONTROL | FORCE if self._force else CONTROL
         self._controls = np.empty((num_envs, task.steps_per_env_step, inputs))
 
     def reset(self, rng: np.random.Generator) -> EnvState:
@@ -143,8 +145,8 @@ class CpuEnvs:
         """
         task, model = self.task, self.task.model
         self._controls[:, :, : model.nu] = control[:, None]
-        if task.force:
-            self._controls[:, :, model.nu :] = task.force(state.task, np)[:, None]
+        if self._force:
+            self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
         cpu = time.process_time()
         self._rollout.rollout(
             self._models,

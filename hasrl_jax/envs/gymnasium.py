@@ -5,19 +5,19 @@ It is the collectors' own `CpuEnvs` with a single environment, so what is true o
 
 import os
 import weakref
+from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 
-from hasrl_jax.config.checks import check, limits_of
+from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import recipe
+from hasrl_jax.config.limits import Limits, check_number
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cassie import task as cassie
-from hasrl_jax.envs.cassie.commands import COMMANDS, completed
-from hasrl_jax.envs.cassie.settings import CommandConfig
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
@@ -42,43 +42,6 @@ def make(task: str = "cassie", config: Config | None = None, **arguments: Any) -
     return TaskEnv(recipe(task) if config is None else from_dict({"task": task}, config), **arguments)
 
 
-def fixed_command(
-    config: Config,
-    forward: float | None = None,
-    lateral: float | None = None,
-    yaw_rate: float | None = None,
-    height: float | None = None,
-) -> Config:
-    """`config` with Cassie's commands (m/s, rad/s, m) held at the given values; None leaves one to be drawn.
-
-    Raises:
-      ConfigError: a command that the robot does not take in the frame of `config`.
-    """
-    told = {"forward": forward, "lateral": lateral, "yaw_rate": yaw_rate, "height": height}
-    held = {name: value for name, value in told.items() if value is not None}
-    if not held:
-        return config
-    if not hasattr(config.settings, "command"):
-        raise ConfigError(f"command: task {config.task!r} takes no command")
-    settings = config.settings.command
-    known = {entry.name: entry.field for entry in COMMANDS[settings.frame]}
-    for name in held:
-        if name not in known:
-            raise ConfigError(f"{name}: cassie.command.frame {settings.frame} has {', '.join(known)}")
-    command: dict[str, Any] = dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0)
-    command |= {known[name]: [value, value] for name, value in held.items()}
-    if yaw_rate is not None:
-        command["turn_m_s2"] = limits_of(CommandConfig, "turn_m_s2").high
-    if height is not None:
-        command |= {
-            "height_probability": 1.0,
-            "height_fade_m_s": [limits_of(CommandConfig, "height_fade_m_s").high] * 2,
-        }
-    if len(held) == len(known):
-        command["resample_s"] = [0.0, 0.0]
-    return from_dict({"cassie": {"command": command}}, config)
-
-
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task in C MuJoCo.
 
@@ -87,7 +50,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     is truncated with reward 0, and its last valid observation is returned again.
 
     Args:
-      config: default `configs/cassie_walk.yaml`; reads `task`, `physics`, `cassie` and `collect.max_episode_steps`.
+      config: default `configs/cassie_walk.yaml`; reads `task`, `physics`, the task's settings and
+        `collect.max_episode_steps`.
       render_mode: None or "rgb_array".
       width, height: of rendered frames, pixels.
       camera: name of a camera of the model.
@@ -117,7 +81,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._renderer: mujoco.Renderer | None = None
         self._state: EnvState | None = None
         self._ended = False
-        self._open(self.config)
+        self._open()
         cameras = [self.task.model.camera(index).name for index in range(self.task.model.ncam)]
         if camera not in cameras:
             raise ConfigError(f"camera: got {camera!r}; expected one of {', '.join(cameras)}")
@@ -132,19 +96,25 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
           seed: seeds the random stream; None goes on with it.
-          options: `{"command": (forward, lateral)}` holds Cassie's commanded speeds, m/s, for this episode; in the
-            heading frame a yaw rate (rad/s) and a height (m) may follow.
+          options: `{"command": (1.0, 0.0)}`, or `{"command": {"forward": 1.0}}`, commands the robot for this episode,
+            see `set_command`.
 
         Raises:
-          ValueError: an unknown option, or a command that is not so many finite numbers.
+          ValueError: an unknown option.
+          ConfigError: a command that the task does not take.
         """
         super().reset(seed=seed)
-        config = self._config_for(options or {})
-        if config != self._running:
-            self._open(config)
+        options = options or {}
+        if set(options) - {"command"}:
+            raise ValueError(f"options: unknown {sorted(set(options) - {'command'})}; known is 'command'")
+        told = options.get("command")
+        command = None if told is None else self.check_command(told)
         self._state = self._envs.reset(self.np_random)
-        self._shown, self._ended = self._state, False
+        self._ended = False
         self._observation = self._state.observation[0].astype(np.float32)
+        if command is not None:
+            self._tell(command)
+        self._shown = self._state
         return self._observation.copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -155,12 +125,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           ValueError: an action of the wrong shape.
           DivergenceError: an action that is not finite.
         """
-        if self._state is None or self._ended:
-            raise RuntimeError("no episode is running: call reset() first")
+        state = self._running()
         action = np.asarray(action, np.float64)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action: got shape {action.shape}; expected {self.action_space.shape}")
-        self._state, result = self._envs.step(self._state, action[None], self.np_random)
+        self._state, result = self._envs.step(state, action[None], self.np_random)
         diverged = bool(result.diverged[0])
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0]) or diverged
         self._ended = terminated or truncated
@@ -188,13 +157,17 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer = self._make_renderer()
         renderer, data = self._renderer, self._render_data
         data.qpos[:] = self.qpos
-        if self.task.ground:
-            ground = renderer.model.geom_bodyid == 0  # the first geoms of any model
-            for name in ("geom_pos", "geom_size"):
-                getattr(renderer.model, name)[ground] = self._shown.model_fields[name][0, : ground.sum()]
+        self.place_ground(renderer.model)
         mujoco.mj_forward(renderer.model, data)
         renderer.update_scene(data, self._camera)
         return renderer.render()
+
+    def place_ground(self, model: mujoco.MjModel) -> None:
+        """Puts the ground of the running episode into `model`, another copy of the task's; level ground stays."""
+        if self.task.ground:
+            ground = model.geom_bodyid == 0  # the first geoms of any model
+            for name in ("geom_pos", "geom_size"):
+                getattr(model, name)[ground] = self._shown.model_fields[name][0, : ground.sum()]
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -202,49 +175,61 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer.close()
             self._renderer = None
 
-    def push(self, forward_n_s: float, lateral_n_s: float) -> None:
-        """Adds momentum to the whole robot at once, N s along the world's x and y.
+    def push(self, forward_n: float, lateral_n: float) -> None:
+        """Pushes the robot with a force, N along the world's x and y, from now for `task.push_s` seconds.
 
         Raises:
-          ValueError: the task's robot does not float; RuntimeError: no episode is running.
+          ConfigError: the task's robot cannot be pushed; RuntimeError: no episode is running.
         """
-        if self.task.name != "cassie":
-            raise ValueError(f"push: task {self.task.name!r} has no floating robot")
-        if self._state is None or self._ended:
-            raise RuntimeError("no episode is running: call reset() first")
-        mass = self._state.model_fields.get("body_mass", np.asarray(self.task.model.body_mass)).sum()
-        physics = self._state.physics.copy()
-        # The first two degrees of freedom translate all bodies together, so their momentum is mass times velocity.
-        velocity = 1 + self.task.model.nq
-        physics[0, velocity : velocity + 2] += np.array([forward_n_s, lateral_n_s]) / mass
-        self._state = self._state._replace(physics=physics)
+        if self.task.with_push is None:
+            raise ConfigError(f"push: the robot of task {self.task.name!r} cannot be pushed")
+        state = self._running()
+        force = np.array([[forward_n, lateral_n]], np.float64)
+        self._state = state._replace(task=self.task.with_push(state.task, force, np))
 
-    def set_command(self, forward_m_s: float, lateral_m_s: float, *more: float) -> np.ndarray:
-        """Commands Cassie these speeds from now to the end of the episode.
+    def set_command(self, *told: float, **named: float) -> np.ndarray:
+        """Commands the robot from now to the end of the episode.
 
         Args:
-          forward_m_s: forward speed.
-          lateral_m_s: lateral speed, left is positive.
-          *more: in the heading frame the yaw rate, rad/s, and the height, m; 0 and the usual one without.
+          *told: the first of the task's commands (`task.commands`) in their order and units.
+          **named: others by name; those that are not told take their default.
 
         Returns:
           The observation to act on: the last one, with the new command.
 
         Raises:
-          ConfigError: speeds that are not finite or out of limits, or a task without commands.
+          ConfigError: numbers that are not finite or out of limits, or a command that the task does not take.
           RuntimeError: no episode is running.
         """
-        told = (forward_m_s, lateral_m_s, *more)
-        self._commanded(told)
-        if self._state is None or self._ended:
-            raise RuntimeError("no episode is running: call reset() first")
-        cassie_config = self.config.settings
-        command = np.array([completed(told, cassie_config.command, cassie_config.reward.height_m)], np.float64)
-        before = self._state.task, self._state.observation
-        task_state, observation = cassie.with_command(cassie_config, *before, command, np)
-        self._state = self._state._replace(task=task_state, observation=observation)
-        self._observation = observation[0].astype(np.float32)
+        command = self.check_command(told, **named)
+        self._running()
+        self._tell(command)
         return self._observation.copy()
+
+    def check_command(self, told: Any, **named: float) -> np.ndarray:
+        """A whole command [C] from what is told of it, numbers in order or by name; in force only by `set_command`.
+
+        Raises:
+          ConfigError: names the command, the value and what would work.
+        """
+        commands = self.task.commands
+        if not commands:
+            raise ConfigError(f"command: task {self.task.name!r} takes no command")
+        if isinstance(told, Mapping):
+            told, named = (), {**told, **named}
+        known = ", ".join(f"{command.name} ({command.unit})" for command in commands)
+        if not isinstance(told, Sequence | np.ndarray) or len(told) > len(commands):
+            raise ConfigError(f"command: got {told!r}; expected at most {len(commands)} numbers: {known}")
+        values = dict(zip((command.name for command in commands), told, strict=False)) | named
+        unknown = sorted(values.keys() - {command.name for command in commands})
+        if unknown:
+            raise ConfigError(f"command: got {unknown[0]!r}; expected {known}")
+        whole = [values.get(command.name, command.default) for command in commands]
+        for command, value in zip(commands, whole, strict=True):
+            if not isinstance(value, Real):
+                raise ConfigError(f"command {command.name}: got {value!r}; expected a number, {command.unit}")
+            check_number(f"command {command.name}", value, Limits(*command.limits))
+        return np.array(whole, np.float64)
 
     @property
     def qpos(self) -> np.ndarray:
@@ -258,30 +243,36 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         timestep = fields["timestep"][0] if "timestep" in fields else self.task.model.opt.timestep
         return float(timestep) * self.task.steps_per_env_step
 
-    def _open(self, config: Config) -> None:
-        self._running = config
-        self.task: Task = make_task(config)
-        self._envs = CpuEnvs(self.task, 1, config.collect.max_episode_steps)
+    def __getstate__(self) -> dict[str, Any]:
+        # What is simulated is arrays, and is copied; the engine and the renderer are made anew.
+        left_out = ("task", "_envs", "_renderer", "_render_data")
+        return {name: value for name, value in vars(self).items() if name not in left_out}
 
-    def _config_for(self, options: dict[str, Any]) -> Config:
-        unknown = set(options) - {"command"}
-        if unknown:
-            raise ValueError(f"options: unknown {sorted(unknown)}; known is 'command'")
-        return self._commanded(options["command"]) if "command" in options else self.config
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._renderer = None
+        self._open()
+        if self._state is not None:
+            self._envs.restore(self._state)
 
-    def _commanded(self, told: Any) -> Config:
-        """The configuration that holds the command at these numbers, checked."""
-        if self.task.name != "cassie":
-            raise ConfigError(f"command: task {self.task.name!r} takes no command")
-        command, cassie_config = np.asarray(told, np.float64), self.config.settings
-        most = len(COMMANDS[cassie_config.command.frame])
-        if command.ndim != 1 or not 2 <= len(command) <= most or not np.isfinite(command).all():
-            more = "" if most == 2 else ", which a yaw rate in rad/s and a height in m may follow"
-            raise ConfigError(f"command: got {told!r}; expected two finite speeds in m/s{more}")
-        whole = completed(command.tolist(), cassie_config.command, cassie_config.reward.height_m)
-        config = fixed_command(self.config, *whole)
-        check(config)
-        return config
+    def _open(self) -> None:
+        """Makes the task and the engine that runs it."""
+        self.task: Task = make_task(self.config)
+        pushable = self.task.with_push is not None
+        self._envs = CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, pushable)
+
+    def _running(self) -> EnvState:
+        """The state of the running episode."""
+        if self._state is None or self._ended:
+            raise RuntimeError("no episode is running: call reset() first")
+        return self._state
+
+    def _tell(self, command: np.ndarray) -> None:
+        """Puts a whole command [C] in force."""
+        assert self.task.with_command is not None and self._state is not None
+        state, observation = self.task.with_command(self._state.task, self._state.observation, command[None], np)
+        self._state = self._state._replace(task=state, observation=observation)
+        self._observation = observation[0].astype(np.float32)
 
     def _make_renderer(self) -> mujoco.Renderer:
         # A model of its own: the one that is simulated has no visual shapes and carries the randomised fields.

@@ -135,7 +135,7 @@ class MjxEngine:
 
         # Like the C engine, every environment step starts from a zero warm start, so its state is qpos and qvel.
         data = self.data.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control)
-        if task.force:
+        if task.force and task.disturbed:
             data = data.replace(qfrc_applied=task.force(state.task, jnp))
         total = jnp.zeros_like(task.physics_features(data.sensordata, jnp))
         (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), None, length=task.steps_per_env_step)

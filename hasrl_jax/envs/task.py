@@ -46,6 +46,19 @@ class Transition(NamedTuple):
     measures: Array  # [..., M] what evaluation reports, in the order of `Task.measures`
 
 
+class Command(NamedTuple):
+    """One number that a robot can be told within an episode; its measures are `<name>_command` and `measure`."""
+
+    name: str
+    unit: str
+    default: float  # where nothing is told
+    drawn: tuple[float, float]  # range that episodes draw from
+    limits: tuple[float, float]  # what is accepted
+    measure: str  # the measure that follows it
+    step: float  # by which a slider or a key changes it
+    keys: str = ""  # "up-down" or "left-right": the arrow keys that change it; up and left are positive
+
+
 @dataclass(frozen=True)
 class Task:
     """One task: its model, sizes and functions."""
@@ -67,9 +80,15 @@ class Task:
     # (sensordata [..., ns], xp) -> [..., F]; nothing is averaged over physics steps by default
     physics_features: Callable[[Array, Any], Array] = lambda sensordata, xp: sensordata[..., :0]
     force: Callable[[Any, Any], Array] | None = None  # (state, xp) -> force from outside on each qvel [..., nv]
-    ground: Callable[[mujoco.MjSpec], None] | None = (
-        None  # puts ground that changes by episode into a copy of the model
-    )
+    # puts ground that changes by episode into a copy of the model
+    ground: Callable[[mujoco.MjSpec], None] | None = None
+    disturbed: bool = True  # whether `force` acts by itself; otherwise only after `with_push`
+    commands: tuple[Command, ...] = ()
+    # (state, observation, command [..., C], xp) -> (state, observation): told from now to the end of the episode
+    with_command: Callable[[Any, Array, Array, Any], tuple[Any, Array]] | None = None
+    # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
+    with_push: Callable[[Any, Array, Any], Any] | None = None
+    push_s: float = 0.0
 
     @property
     def observation_size(self) -> int:

@@ -2,7 +2,7 @@
 
 import sys
 
-from hasrl_jax.evaluate.rollout import main
+from hasrl_jax.cli.evaluate import main
 
 if __name__ == "__main__":
     sys.exit(main())

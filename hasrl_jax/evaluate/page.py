@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hasrl_jax.visualize.curves import COLOURS
+from hasrl_jax.evaluate.palette import COLORS
 
 Rows = list[dict[str, Any]]
 
@@ -33,7 +33,7 @@ def number(digits: int) -> Callable[[dict[str, Any]], str]:
 SURVIVAL: tuple[Column, ...] = (
     ("up 20 s", "share_up_20_s", percent),
     ("up to the end", "share_up", percent),
-    ("which is after", "cap_seconds", lambda value: f"{value:g} s"),
+    ("time limit", "cap_seconds", lambda value: f"{value:g} s"),
     ("seconds upright", "seconds", number(1)),
     ("speed, m/s", "forward_speed", number(2)),
     ("speed error, m/s", "forward_speed_error", number(3)),
@@ -93,9 +93,8 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         f"# Scorecard: {policy}\n",
         f"C MuJoCo at {report['physics_hz']:.0f} Hz, mean action, {report['episodes']} episodes a row, seed "
         f"{report['seed']}, at most {cap_s:g} s each, from rest. A fall is a pelvis below 0.6 m or a tilt above 45°. "
-        "In brackets and after ±: 95 % intervals. A speed error is that of the mean speed from 3 s after a command, "
-        "without its sign, averaged over an episode's commands by their time. A randomised episode's seconds are "
-        "nominal ones: its physics rate varies.\n",
+        "In brackets and after ±: 95 % intervals. A speed error is a time-weighted mean absolute error: that of the "
+        "mean speed under a command, from 3 s after it was given, averaged over the commands by the time under each.\n",
         f"`{report['command']}`\n",
         "![Share that stays up, speed, pushes and gait](scorecard.png)\n",
     ]
@@ -132,21 +131,21 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     walking = select(rows, "speed")
     commanded = [row["forward_m_s"][0] for row in walking]
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.2), layout="constrained")
-    for colour, randomized in zip(COLOURS, (False, True), strict=False):
+    for colour, randomized in zip(COLORS, (False, True), strict=False):
         chosen = select(rows, "speed", randomized=randomized)
         label = "randomised" if randomized else "nominal"
         _curve(axes[0], chosen, "share_up", label, colour, scale=100)
         _curve(axes[1], chosen, "forward_speed", label, colour)
-    for colour, (name, theirs) in zip(COLOURS[2:] * 9, list(policies.items())[1:], strict=False):
+    for colour, (name, theirs) in zip(COLORS[2:] * 9, list(policies.items())[1:], strict=False):
         _curve(axes[0], select(theirs, "speed"), "share_up", name, colour, scale=100)
     axes[1].plot(commanded, commanded, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
     pushes = select(rows, "push")
-    for colour, speed in zip(COLOURS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
+    for colour, speed in zip(COLORS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
         chosen = [row for row in pushes if row["forward_m_s"][0] == speed]
         _curve(axes[2], chosen, "share_up", f"{speed:g} m/s", colour, scale=100)
-    _curve(axes[3], walking, "step_frequency_hz", "steps per second", COLOURS[0])
-    _curve(axes[3], walking, "duty_factor", "duty factor", COLOURS[1])
-    _curve(axes[3], walking, "cost_of_transport", "cost of transport", COLOURS[2])
+    _curve(axes[3], walking, "step_frequency_hz", "steps per second", COLORS[0])
+    _curve(axes[3], walking, "duty_factor", "duty factor", COLORS[1])
+    _curve(axes[3], walking, "cost_of_transport", "cost of transport", COLORS[2])
     titles = (
         (f"stays up {walking[0]['cap_seconds']:g} s, %" if walking else "stays up, %", "commanded, m/s"),
         ("speed, m/s", "commanded, m/s"),

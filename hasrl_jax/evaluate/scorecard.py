@@ -19,11 +19,13 @@ import numpy as np
 
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
+from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
 from hasrl_jax.evaluate.page import percent, write_page
-from hasrl_jax.evaluate.rollout import columns, mean_interval, run_episodes, settled_speeds, share_interval
+from hasrl_jax.evaluate.rollout import run_episodes
+from hasrl_jax.evaluate.statistics import columns, mean_interval, settled_errors, share_interval
 from hasrl_jax.policy.blas import ONE_THREAD
 from hasrl_jax.policy.numpy_networks import Parameters
 
@@ -41,7 +43,7 @@ FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
 # What every row sets itself, of `cassie`.
 SETTINGS = ("command", "push", "terrain", "termination", "randomize.enabled", "randomize.share")
-REVISION = 2  # of what a row plays and what its figures mean; those of an earlier one are measured anew
+REVISION = 3  # of what a row plays and what its figures mean; those of an earlier one are measured anew
 BATCH = 25  # episodes that one job plays side by side
 
 
@@ -88,7 +90,11 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
         "command": {
             "forward_m_s": list(row.forward_m_s),
             "lateral_m_s": list(row.lateral_m_s),
-            "stand_probability": 0.0,
+            # In the heading frame: straight ahead, at the usual height.
+            "yaw_rate_rad_s": [0.0, 0.0],
+            "height_m": [trained.settings.reward.height_m] * 2,
+            "start_heading_rad": 0.0,
+            **dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0),
             "start_moving": 0.0,
             "resample_s": list(CHANGE_S) if row.kind == "changing" else [0.0, 0.0],
         },
@@ -129,7 +135,7 @@ def write(
       ConfigError: a policy of another task; OSError: the directory cannot be written.
     """
     for name, (config, _) in policies.items():
-        if config.task != "cassie":
+        if not isinstance(config.settings, CassieConfig):
             raise ConfigError(f"--scorecard: {name} is of task {config.task}; only policies that walk have one")
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scorecard.json"
@@ -221,7 +227,8 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
     """Per-episode figures of a part of a row, each [N]."""
     _, config, parameters, episodes, seed = job
     task = make_task(config)
-    played = run_episodes(config, task, parameters, episodes, seed)
+    cap_s = config.collect.max_episode_steps * config.physics.env_step_s
+    played = run_episodes(config, task, parameters, episodes, seed, seconds=cap_s)
     column = columns(played, task)
     mass = float(task.model.body_mass.sum())
     figures = gait.describe(
@@ -234,9 +241,9 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
     )
     last = np.maximum(played.episode_length - 1, 0)
     heading = np.unwrap(np.nan_to_num(column["heading"]), axis=0)[last, np.arange(episodes)]
-    speeds = settled_speeds(column, task.env_step_s)
+    speeds = settled_errors(column, task.commands, task.env_step_s)
     return {
-        "seconds": played.episode_length * task.env_step_s,
+        "seconds": played.seconds,
         "reached_cap": played.reached_cap,
         "diverged": played.diverged,
         **{name: speeds[name] for name in ("forward_speed", "forward_speed_error", "lateral_speed_error")},

@@ -1,15 +1,16 @@
 """Loads the parameters that a policy acts with, from a run directory or from a released policy file."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hasrl_jax.config import tasks
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.compat import upgraded
 from hasrl_jax.config.convert import from_dict, to_dict
-from hasrl_jax.config.files import shipped
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import layout
 from hasrl_jax.envs.layout import Entry
@@ -69,11 +70,10 @@ def load_baseline(name: str, like: Config) -> tuple[Config, dict[str, np.ndarray
     return like, {key: array if key in keep else factor * array for key, array in parameters.items()}
 
 
-def with_physics(config: Config, physics: str) -> Config:
-    """`config` with the walking task at the "paper" 2 kHz physics; for "training", or another task, as it is."""
-    if physics == "training" or config.task != "cassie":
-        return config
-    return from_dict({"physics": to_dict(shipped("paper").physics)}, config)
+def under_reference_physics(config: Config) -> Config:
+    """`config` with the physics that a policy of its task is judged under, see `TaskSpec.reference_physics`."""
+    physics = tasks.find(config.task).reference_physics
+    return config if physics is None else dataclasses.replace(config, physics=physics())
 
 
 def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:

@@ -1,24 +1,21 @@
-"""Figures of training runs on disk: `python -m hasrl_jax.figures fig3 --run-dir DIR`.
+"""Figures of training runs on disk.
 
 fig3   episode return in training and testing, mean ratio, entropy (paper Fig. 3)
 fig4   mean ratio and episode return of several runs, named by what differs in them (paper Fig. 4)
 curve  episode length and return against environment steps and against time
 """
 
-import argparse
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hasrl_jax.cli import parsing as cli
-from hasrl_jax.cli.options import OneLineParser, require_writable
 from hasrl_jax.config.convert import to_dict
 from hasrl_jax.config.schema import Config
-from hasrl_jax.errors import ConfigError, RunError
-from hasrl_jax.runs.directory import METRICS_FILE, load_run_config
+from hasrl_jax.errors import RunError
+from hasrl_jax.evaluate.palette import COLORS
+from hasrl_jax.runs.directory import METRICS_FILE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,9 +23,7 @@ if TYPE_CHECKING:
 
 RENAMED = {"episode_return_test": "eval_return", "episode_length_test": "eval_length"}  # since version 0.1
 Series = dict[str, np.ndarray]
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 SMOOTHED = 9  # iterations in the moving mean that is drawn over the raw values of fig4
-DPI = 110
 
 
 def read_metrics(run_dir: Path) -> Series:
@@ -75,15 +70,15 @@ def fig3(runs: list[Series], names: list[str]) -> "Figure":
     """Paper Fig. 3 of one run."""
     figure, axes = _axes(3)
     run, x = runs[0], runs[0]["iteration"]
-    axes[0].plot(x, run["episode_return_train"], color=COLOURS[0], linewidth=0.8, label="training")
+    axes[0].plot(x, run["episode_return_train"], color=COLORS[0], linewidth=0.8, label="training")
     if "eval_return" in run:
         evaluated = np.isfinite(run["eval_return"])
-        axes[0].plot(x[evaluated], run["eval_return"][evaluated], color=COLOURS[1], linewidth=1, label="evaluation")
+        axes[0].plot(x[evaluated], run["eval_return"][evaluated], color=COLORS[1], linewidth=1, label="evaluation")
     axes[0].legend(fontsize=7)
     _label(axes[0], "(a) episode return", "iteration")
-    axes[1].plot(x, run["ratio_mean"], color=COLOURS[0], linewidth=0.8)
+    axes[1].plot(x, run["ratio_mean"], color=COLORS[0], linewidth=0.8)
     _label(axes[1], "(b) mean ratio", "iteration")
-    axes[2].plot(x, run["entropy"], color=COLOURS[0], linewidth=1)
+    axes[2].plot(x, run["entropy"], color=COLORS[0], linewidth=1)
     _label(axes[2], "(c) entropy", "iteration")
     return figure
 
@@ -91,7 +86,7 @@ def fig3(runs: list[Series], names: list[str]) -> "Figure":
 def fig4(runs: list[Series], names: list[str]) -> "Figure":
     """Paper Fig. 4: one line per run."""
     figure, axes = _axes(2)
-    for colour, run, name in zip(COLOURS, runs, names, strict=False):
+    for colour, run, name in zip(COLORS, runs, names, strict=False):
         for axis, metric in zip(axes, ("ratio_mean", "episode_return_train"), strict=True):
             axis.plot(run["iteration"], run[metric], color=colour, linewidth=0.4, alpha=0.4)
             axis.plot(run["iteration"], moving_mean(run[metric]), color=colour, linewidth=1.2, label=name)
@@ -105,7 +100,7 @@ def fig4(runs: list[Series], names: list[str]) -> "Figure":
 def curve(runs: list[Series], names: list[str]) -> "Figure":
     """Episode length and return of every run against environment steps and time."""
     figure, axes = _axes(4)
-    for colour, run, name in zip(COLOURS, runs, names, strict=False):
+    for colour, run, name in zip(COLORS, runs, names, strict=False):
         seconds = run.get("train_seconds", np.nancumsum(run["collect_seconds"] + run["update_seconds"]))
         xs = (run["env_steps"] / 1e6, seconds / 60)
         for axis, (metric, x) in zip(axes, ((m, x) for m in ("length", "return") for x in xs), strict=True):
@@ -138,43 +133,3 @@ def _label(axis: "Axes", title: str, x: str) -> None:
     axis.set_title(title, fontsize=10)
     axis.set_xlabel(x)
     axis.grid(alpha=0.3)
-
-
-def draw(arguments: list[str]) -> None:
-    """The command.
-
-    Raises:
-      ConfigError: an impossible argument; RunError: a run that cannot be read.
-    """
-    parser = OneLineParser(
-        prog="python -m hasrl_jax.figures",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("name", choices=tuple(FIGURES))
-    parser.add_argument("--run-dir", type=Path, nargs="+", required=True, help="run directories; fig3 takes one")
-    parser.add_argument("--labels", nargs="+", help="a name for each run; default: the settings that differ")
-    parser.add_argument("--out", type=Path, help="the PNG; default: NAME.png")
-    known = parser.parse_args(arguments)
-    out = known.out or Path(f"{known.name}.png")
-    if known.name == "fig3" and len(known.run_dir) > 1:
-        raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; fig3 shows one")
-    if len(known.run_dir) > len(COLOURS):
-        raise ConfigError(f"--run-dir: got {len(known.run_dir)} runs; expected at most {len(COLOURS)}")
-    if known.labels and len(known.labels) != len(known.run_dir):
-        raise ConfigError(f"--labels: got {len(known.labels)}; expected one for each of {len(known.run_dir)} runs")
-    require_writable("--out", out, ".png")
-    names = known.labels or differences([load_run_config(run_dir) for run_dir in known.run_dir])
-    FIGURES[known.name]([read_metrics(run_dir) for run_dir in known.run_dir], names).savefig(out, dpi=DPI)
-    print(f"{out}: {known.name} of {', '.join(map(str, known.run_dir))}")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit status."""
-    cli.log_to_terminal()
-    return cli.run(lambda: draw(sys.argv[1:] if argv is None else argv))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

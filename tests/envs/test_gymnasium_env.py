@@ -1,8 +1,11 @@
 """The gymnasium interface."""
 
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 
 import gymnasium
 import mujoco
@@ -13,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 import hasrl_jax  # noqa: F401 (importing it registers the environments)
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs
-from hasrl_jax.envs.gymnasium import TaskEnv, fixed_command, make
+from hasrl_jax.envs.gymnasium import TaskEnv, make
 from hasrl_jax.envs.registration import ENVIRONMENTS
 from hasrl_jax.errors import ConfigError
 
@@ -63,16 +66,26 @@ def test_equals_the_collectors_environments() -> None:
         env.step(actions[0])
 
 
-def test_fixed_command() -> None:
+def test_a_command_of_the_reset_holds_for_its_episode() -> None:
     env = make("cassie")
-    for command in ((0.8, -0.05), (-0.2, 0.1)):
-        observation, _ = env.reset(seed=0, options={"command": command})
+    for told in ((0.8, -0.05), {"lateral": 0.1, "forward": -0.2}):
+        command = tuple(told) if isinstance(told, tuple) else (told["forward"], told["lateral"])
+        observation, _ = env.reset(seed=0, options={"command": told})
         np.testing.assert_allclose(observation[48:], command, rtol=1e-6)
         observation, *_, info = env.step(np.zeros(10, np.float32))
         np.testing.assert_allclose(observation[48:], command, rtol=1e-6)
         assert info["forward_command"] == pytest.approx(command[0])
     drawn = [tuple(env.reset(seed=seed)[0][48:]) for seed in range(4)]
     assert len(set(drawn)) > 1  # the option held for its own episode only
+
+
+def test_neither_commands_nor_options_make_anything_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make("cassie")
+    task, envs = env.task, env._envs
+    env.reset(seed=0, options={"command": (0.5,)})
+    env.set_command(forward=1.0)
+    env.reset(seed=1)
+    assert env.task is task and env._envs is envs
 
 
 def test_a_command_can_change_within_an_episode() -> None:
@@ -109,12 +122,12 @@ def test_commands_of_the_heading_frame() -> None:
     env.reset(seed=0)
     standing = env.set_command(0.0, 0.0)
     np.testing.assert_array_equal(standing[46:], [0, 0, 0, 0, 0, np.float32(0.9)])  # the clock rests at once
-    with pytest.raises(ConfigError, match="yaw rate in rad/s and a height"):
+    with pytest.raises(ConfigError, match=r"expected at most 4 numbers: forward \(m/s\), .*height \(m\)$"):
         env.set_command(0.0, 0.0, 0.0, 0.9, 1.0)
-    with pytest.raises(ConfigError, match=r"two finite speeds in m/s$"):
+    with pytest.raises(ConfigError, match=r"expected at most 2 numbers: forward \(m/s\), lateral \(m/s\)$"):
         make("cassie").reset(options={"command": (0.0, 0.0, 0.5)})
-    with pytest.raises(ConfigError, match=r"yaw_rate: cassie\.command\.frame world has forward, lateral"):
-        fixed_command(from_dict({}), yaw_rate=0.5)
+    with pytest.raises(ConfigError, match=r"command: got 'yaw_rate'; expected forward \(m/s\), lateral \(m/s\)$"):
+        make("cassie").check_command((), yaw_rate=0.5)
 
 
 def test_impossible_commands_are_refused() -> None:
@@ -122,10 +135,12 @@ def test_impossible_commands_are_refused() -> None:
     with pytest.raises(RuntimeError, match="reset"):
         env.set_command(0.0, 0.0)
     env.reset(seed=0)
-    with pytest.raises(ConfigError, match="finite"):
+    with pytest.raises(ConfigError, match="command forward: got nan; expected -10 to 10"):
         env.set_command(float("nan"), 0.0)
-    with pytest.raises(ConfigError, match="forward_m_s"):
-        env.set_command(11.0, 0.0)
+    with pytest.raises(ConfigError, match=r"command lateral: got 11\.0; expected -10 to 10"):
+        env.set_command(0.0, 11.0)
+    with pytest.raises(ConfigError, match="command forward: got 'fast'; expected a number, m/s"):
+        env.set_command("fast")
     pole = make("cartpole")
     pole.reset(seed=0)
     with pytest.raises(ConfigError, match="cartpole"):
@@ -159,15 +174,52 @@ def test_a_diverged_simulation_truncates_with_the_last_valid_observation() -> No
     np.testing.assert_array_equal(observation, before)
 
 
-def test_a_push_adds_its_momentum() -> None:
-    env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": False}}}))
-    env.reset(seed=0)
-    env.push(0.0, 10.0)
+def momentum(env: TaskEnv) -> np.ndarray:
+    """Of the whole robot, N s along the world's axes."""
     model, data = env.task.model, mujoco.MjData(env.task.model)
     data.qpos[:], data.qvel[:] = np.split(env._state.physics[0, 1:], [model.nq])
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
-    np.testing.assert_allclose(data.subtree_linvel[0] * model.body_mass.sum(), [0, 10, 0], atol=1e-9)
+    return data.subtree_linvel[0] * model.body_mass.sum()
+
+
+def test_a_push_is_a_force_on_the_pelvis_for_its_time_as_the_tasks_own() -> None:
+    """Pushed on request, or by the task's own draw of the same force at the same moment: the same motion."""
+    calm = {"randomize": {"enabled": False}}
+    size, first = 100.0, 10  # N; environment step from which it acts
+    push = {"force_n": [size, size], "interval_s": [0.24, 0.24]}
+    drawn = make("cassie", from_dict({"cassie": calm | {"push": push}}))
+    asked = make("cassie", from_dict({"cassie": calm}))
+    plain = make("cassie", from_dict({"cassie": calm}))
+    for env in (drawn, asked, plain):
+        env.reset(seed=4)
+    force = drawn._state.task.push[0]
+    assert np.linalg.norm(force) == pytest.approx(size)
+    for step in range(22):
+        if step == first:
+            asked.push(*force)
+        for env in (drawn, asked, plain):
+            env.step(np.zeros(10))
+        np.testing.assert_allclose(asked._state.physics, drawn._state.physics, rtol=0, atol=1e-12)
+        if step == first:  # the first of the eight steps in which the force acts
+            gained = momentum(asked) - momentum(plain)
+            np.testing.assert_allclose(gained[:2], force * 0.025, atol=0.15 * size * 0.025)  # the feet take some of it
+    with pytest.raises(ConfigError, match="'cartpole' cannot be pushed"):
+        make("cartpole").push(1.0, 0.0)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_as_the_original(duplicate: Callable[[TaskEnv], TaskEnv]) -> None:
+    env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": True}}}))
+    env.reset(seed=0)
+    env.step(np.zeros(10))
+    twin = duplicate(env)
+    for action in np.random.default_rng(0).uniform(-1, 1, (30, 10)):
+        ours, theirs = env.step(action), twin.step(action)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        assert ours[1:4] == theirs[1:4]
+        if ours[2]:
+            break
 
 
 def test_bad_arguments() -> None:
@@ -182,7 +234,7 @@ def test_bad_arguments() -> None:
         env.step(np.zeros(10))
     with pytest.raises(ValueError, match="speed"):
         env.reset(options={"speed": 1})
-    with pytest.raises(ValueError, match="command"):
+    with pytest.raises(ConfigError, match="command lateral: got nan"):
         env.reset(options={"command": (1.0, float("nan"))})
     env.reset(seed=0)
     with pytest.raises(ValueError, match="shape"):

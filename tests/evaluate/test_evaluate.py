@@ -9,18 +9,21 @@ import jax
 import numpy as np
 import pytest
 
+from hasrl_jax.cli import evaluate as cli_evaluate
+from hasrl_jax.cli import render as cli_render
+from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.evaluate import rollout as evaluate
+from hasrl_jax.evaluate import rollout, statistics
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.visualize import render
 
 PHYSICS = {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"}
+COMMANDS = make_task(from_dict({})).commands
 CARTPOLE = {"task": "cartpole", "network": {"hidden_size": 8}, "physics": PHYSICS}
 
 
@@ -53,13 +56,13 @@ def test_a_step_that_diverged_does_not_count(policy, monkeypatch):
         return state, broken._replace(reward=np.where(gone, np.nan, 1.0), measures=np.full_like(result.measures, 1e9))
 
     monkeypatch.setattr(CpuEnvs, "step", failing)
-    episodes = evaluate.run_episodes(config, task, parameters, 2, seed=0)
+    episodes = rollout.run_episodes(config, task, parameters, 2, seed=0)
     np.testing.assert_array_equal(episodes.diverged, [True, False])
     np.testing.assert_array_equal(episodes.episode_length, [2, 4])
     np.testing.assert_array_equal(episodes.reached_cap, [False, True])
     assert np.isfinite(episodes.episode_return).all()
     assert np.isnan(episodes.measures[2:, 0]).all()
-    assert evaluate.summarize(episodes, task)["diverged_episodes"] == 1
+    assert statistics.summarize(episodes, task)["diverged_episodes"] == 1
 
 
 def test_a_speed_error_does_not_cancel_between_commands():
@@ -69,19 +72,19 @@ def test_a_speed_error_does_not_cancel_between_commands():
     still = np.where(np.isfinite(np.transpose(command)), 0.0, nan)
     column = {"forward_command": np.transpose(command), "forward_speed": np.transpose(speed)}
     column |= {"lateral_command": still, "lateral_speed": still}
-    speeds = evaluate.settled_speeds(column, env_step_s=evaluate.SETTLE_S)
+    speeds = statistics.settled_errors(column, COMMANDS, env_step_s=statistics.SETTLE_S)
     np.testing.assert_allclose(speeds["forward_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
     np.testing.assert_allclose(speeds["forward_speed"], [1.225, 1.15, nan])
     np.testing.assert_allclose(speeds["lateral_speed_error"], [0.0, 0.0, nan])
     swapped = {"forward_command": still, "forward_speed": still}
     swapped |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_speed"]}
-    speeds = evaluate.settled_speeds(swapped, env_step_s=evaluate.SETTLE_S)
+    speeds = statistics.settled_errors(swapped, COMMANDS, env_step_s=statistics.SETTLE_S)
     np.testing.assert_allclose(speeds["lateral_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
 
 
 def test_the_command_writes_its_summary(policy, tmp_path, capsys):
     arguments = ["--policy", str(policy), "--episodes", "2", "--seconds", "0.5", "--json", str(tmp_path / "out.json")]
-    assert evaluate.main([*arguments, "--physics.solver-iterations", "8"]) == 0
+    assert evaluate_main([*arguments, "--physics.solver-iterations", "8"]) == 0
     assert "diverged_episodes" in capsys.readouterr().out
     summary = json.loads((tmp_path / "out.json").read_text())
     assert summary["episodes"] == 2
@@ -97,8 +100,8 @@ def test_cassie_is_judged_with_the_physics_of_the_paper(tmp_path, monkeypatch):
         seen.append(config.physics)
         raise ConfigError("enough")
 
-    monkeypatch.setattr(evaluate, "make_task", stop)
-    assert evaluate.main(["--policy", str(path)]) == 2
+    monkeypatch.setattr(cli_evaluate, "make_task", stop)
+    assert evaluate_main(["--policy", str(path)]) == 2
     physics = seen[0]
     assert (physics.timestep_s, physics.steps_per_env_step) == (0.0005, 50)
     assert (physics.solver, physics.integrator) == ("Newton", "Euler")
@@ -128,9 +131,9 @@ def test_cassie_is_judged_with_the_physics_of_the_paper(tmp_path, monkeypatch):
 )
 def test_bad_arguments_are_one_line(policy, arguments, named, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluate, "run_episodes", lambda *_: pytest.fail("the work began"))
+    monkeypatch.setattr(cli_evaluate, "run_episodes", lambda *_: pytest.fail("the work began"))
     try:
-        status = evaluate.main(["--policy", str(policy), *arguments])
+        status = evaluate_main(["--policy", str(policy), *arguments])
     except SystemExit as stopped:
         status = stopped.code
     error = capsys.readouterr().err
@@ -151,9 +154,9 @@ def test_bad_arguments_are_one_line(policy, arguments, named, capsys, tmp_path, 
 )
 def test_render_refuses_the_same(policy, arguments, named, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    known, rest = render._parse(["--policy", str(policy), *arguments])
+    known, rest = cli_render._parse(["--policy", str(policy), *arguments])
     with pytest.raises(ConfigError, match=named):
-        render.render(known, rest)
+        cli_render.render(known, rest)
     assert not list(tmp_path.iterdir())
 
 

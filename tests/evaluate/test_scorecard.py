@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.cassie.commands import PUSH_UNIFORMS, draw_push, next_push
-from hasrl_jax.evaluate import rollout as evaluate
-from hasrl_jax.evaluate import scorecard
+from hasrl_jax.evaluate import rollout, scorecard
 from hasrl_jax.evaluate.scorecard import Row
 from hasrl_jax.policy.loading import load_baseline
 
@@ -73,7 +73,7 @@ def test_pushed_episodes_are_those_up_at_the_push() -> None:
 def test_a_zero_policy_never_acts() -> None:
     config, parameters = load_baseline("zero", from_dict({}))
     assert not any(array.any() for name, array in parameters.items() if name.startswith("policy/lstm"))
-    episodes = evaluate.run_episodes(config, scorecard.make_task(config), parameters, 2, 0)
+    episodes = rollout.run_episodes(config, scorecard.make_task(config), parameters, 2, 0)
     assert (episodes.seconds < 3).all()
     _, random = load_baseline("random", from_dict({}))
     assert random["policy/lstm_0_input"].any()
@@ -85,7 +85,7 @@ def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(scorecard, "rows", lambda: few)
     monkeypatch.setattr(scorecard, "BATCH", 2)
     arguments = ["--policy", "released", "--scorecard", str(tmp_path), "--episodes", "3", "--seconds", "4"]
-    assert evaluate.main([*arguments, "--physics", "training", "--against", "zero"]) == 0
+    assert evaluate_main([*arguments, "--physics", "training", "--against", "zero"]) == 0
     report = json.loads((tmp_path / "scorecard.json").read_text())
     assert list(report["policies"]) == ["the released policy", "zero"]
     rows = report["policies"]["the released policy"]
@@ -129,7 +129,7 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
 )
 def test_bad_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
     arguments = [str(tmp_path / "card") if argument == "DIR" else argument for argument in arguments]
-    assert evaluate.main(["--policy", "released", *arguments]) != 0
+    assert evaluate_main(["--policy", "released", *arguments]) != 0
     error = capsys.readouterr().err
     assert message in error
     assert len(error.splitlines()) == 1

@@ -14,7 +14,7 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.evaluate import rollout as evaluate
+from hasrl_jax.evaluate import rollout, statistics
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.policy import numpy_networks as numpy_policy
@@ -29,7 +29,7 @@ def test_the_released_policy_walks_at_the_commanded_speed() -> None:
     changes = {"cassie": {"command": command, "randomize": {"enabled": False}}, "collect": {"max_episode_steps": 240}}
     config = from_dict(changes, config)
     task = make_task(config)
-    episodes = evaluate.run_episodes(config, task, parameters, episodes=2, seed=0)
+    episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
     assert episodes.reached_cap.all()
     forward = episodes.measures[120:, :, task.measures.index("forward_speed")]
     np.testing.assert_allclose(forward.mean(axis=0), 1.0, atol=0.15)
@@ -44,8 +44,8 @@ def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
     config = from_dict({"cassie": ground, "collect": {"max_episode_steps": 320}}, stairs)
     task = make_task(config)
     _, other_parameters = policies.load_policy_parameters(None, "released")
-    assert evaluate.run_episodes(config, task, its_parameters, episodes=3, seed=0).reached_cap.all()
-    assert not evaluate.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
+    assert rollout.run_episodes(config, task, its_parameters, episodes=3, seed=0).reached_cap.all()
+    assert not rollout.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
 
 
 def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(tmp_path: Path) -> None:
@@ -106,9 +106,9 @@ def test_a_policy_goes_on_in_a_task_that_shows_it_more() -> None:
     command |= dict.fromkeys(("stand_probability", "straight_probability", "alone_probability", "start_moving"), 0.0)
     config = from_dict({"cassie": {"command": command}, "collect": {"max_episode_steps": 240}}, config)
     task = make_task(config)
-    episodes = evaluate.run_episodes(config, task, ours, episodes=2, seed=0)
+    episodes = rollout.run_episodes(config, task, ours, episodes=2, seed=0)
     assert episodes.reached_cap.all()
-    means = evaluate.columns(episodes, task)
+    means = statistics.columns(episodes, task)
     np.testing.assert_allclose(means["forward_speed"][120:].mean(axis=0), 2.0, atol=0.2)
     np.testing.assert_allclose(means["yaw_rate"][120:].mean(axis=0), 0.4, atol=0.1)
 

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 import pytest
 
+from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.cli.train import main as train_main
-from hasrl_jax.evaluate import rollout as evaluate
 from hasrl_jax.runs.directory import load_run_config
 from hasrl_jax.train import loop as train
 
@@ -110,7 +110,7 @@ def test_a_policy_goes_on_in_the_other_mode(first: str, second: str, tiny: Path,
     begin = ["--config", str(tiny), "--backend", first, "--run-dir", str(run), "--total-env-steps", str(STEPS)]
     assert train_main(begin) == 0
     played = ["--run-dir", str(run), "--episodes", "3", "--seconds", "0.2", "--json", str(figures)]
-    assert evaluate.main(played) == 0
+    assert evaluate_main(played) == 0
     before = json.loads(figures.read_text())
     assert before["episodes"] == 3
     assert np.isfinite(before["episode_return"]["mean"])
@@ -125,7 +125,7 @@ def test_a_policy_goes_on_in_the_other_mode(first: str, second: str, tiny: Path,
     assert [record["iteration"] for record in records(run)] == [1, 2]
     assert records(run)[-1]["ratio_first"] == pytest.approx(1.0, abs=1e-4)
     assert load_run_config(run).backend == second
-    assert evaluate.main(played) == 0
+    assert evaluate_main(played) == 0
 
 
 @pytest.mark.parametrize(

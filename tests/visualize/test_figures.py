@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hasrl_jax.cli.figures import main as figures_main
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import dump_yaml
 from hasrl_jax.errors import RunError
@@ -59,7 +60,7 @@ def test_each_figure_is_written(name: str, tmp_path: Path) -> None:
     if name != "fig3":
         runs.append(str(_run(tmp_path / "b", ppo={"clip": 0.1})))
     out = tmp_path / "figure.png"
-    assert figures.main([name, "--run-dir", *runs, "--out", str(out)]) == 0
+    assert figures_main([name, "--run-dir", *runs, "--out", str(out)]) == 0
     assert out.stat().st_size > 5000
 
 
@@ -77,7 +78,7 @@ def test_bad_arguments(
 ) -> None:
     _run(tmp_path / "a")
     monkeypatch.chdir(tmp_path)
-    assert figures.main(arguments) != 0
+    assert figures_main(arguments) != 0
     assert capsys.readouterr().err.strip() == f"error: {message}"
 
 

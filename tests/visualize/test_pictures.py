@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hasrl_jax.cli import pictures
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
@@ -14,7 +15,6 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.visualize.pictures import __main__ as pictures
 from hasrl_jax.visualize.pictures import gait, rewards
 from hasrl_jax.visualize.pictures.record import Recording, record
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hasrl_jax.cli import render as cli_render
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.registry import make_task
@@ -68,8 +69,8 @@ def test_speeds_follow_each_other(policy: Path) -> None:
     config, parameters = policies.load_policy_parameters(None, policy)
     env = TaskEnv(from_dict({"cassie": {"command": {"resample_s": [0.1, 0.1]}}}, config), "rgb_array")
     env.render = lambda: np.zeros((2, 2, 3), np.uint8)
-    frames, speeds = 12, render.Speeds([0.5, 0.0, 1.5], 0.1)
-    moments = list(render.play(env, parameters, frames, 0, render.Push(0.0, 0.0), speeds))
+    frames, told = 12, [{"forward": speed, "lateral": 0.1} for speed in (0.5, 0.0, 1.5)]
+    moments = list(render.play(env, parameters, frames, 0, render.Push(0.0, 0.0), told))
     commands = [(m.measures["forward_command"], m.measures["lateral_command"]) for m in moments[1:]]
     assert commands == [(speed, 0.1) for speed in [*[0.5] * 4, *[0.0] * 4, *[1.5] * 3]]
 
@@ -102,7 +103,7 @@ def test_without_opengl_one_line_says_what_to_install(
     policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(opengl, "works", lambda backend: False)
-    assert render.main(["--policy", str(policy), "--out", str(tmp_path / "film.mp4")]) == 1
+    assert cli_render.main(["--policy", str(policy), "--out", str(tmp_path / "film.mp4")]) == 1
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert "libegl1" in message
@@ -119,11 +120,13 @@ def test_candidates_respect_the_setting(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_caption() -> None:
-    speeds = "forward +0.50 m/s, commanded +1.00    left +0.00 m/s, commanded -0.10"
-    assert render.caption(_moment()) == f" 1.25 s    {speeds}"
-    assert render.caption(_moment(falls=2, pushed=True)).endswith("falls 2    PUSH")
-    assert render.caption(_moment(measures={"angle": 0.1})) == " 1.25 s    angle +0.10"
-    drawn = render.draw_text(np.zeros((480, 640, 3), np.uint8), render.caption(_moment(falls=12, pushed=True)))
+    commands = make_task(CONFIG).commands
+    speeds = "forward +0.50 of +1.00 m/s    lateral +0.00 of -0.10 m/s"
+    assert render.caption(_moment(), commands) == f" 1.25 s    {speeds}"
+    assert render.caption(_moment(falls=2, pushed=True), commands).endswith("falls 2    PUSH")
+    assert render.caption(_moment(measures={"angle": 0.1}), ()) == " 1.25 s    angle +0.10"
+    text = render.caption(_moment(falls=12, pushed=True), commands)
+    drawn = render.draw_text(np.zeros((480, 640, 3), np.uint8), text)
     assert drawn[:40].max() == 255
     assert drawn[40:].max() == 0
     assert drawn[:, -8:].max() == 0  # the text fits
@@ -140,15 +143,18 @@ def test_caption() -> None:
         (["--seed", "-1"], "--seed"),
         (["--out", "film.gif"], "--out"),
         (["--speeds", "0", "nan"], "--speeds"),
-        (["--speeds", "0", "11"], "--speeds"),
+        (["--speeds", "0", "11", "--policy", "released"], "forward"),
+        (["--command", "forward", "--policy", "released"], "--command"),
+        (["--command", "jump=1", "--policy", "released"], "jump"),
+        (["--yaw-rate", "1", "--policy", "released"], "yaw_rate"),
         (["--speeds", "1", "--forward", "1"], "--forward"),
         (["--run-dir", "run", "--policy", "released"], "--run-dir"),
     ],
 )
 def test_bad_arguments_name_the_field(arguments: list[str], field: str) -> None:
-    known, rest = render._parse(arguments)
+    known, rest = cli_render._parse(arguments)
     with pytest.raises(ConfigError, match=field):
-        render.render(known, rest)
+        cli_render.render(known, rest)
 
 
 def test_a_policy_of_another_task_is_not_pushed(tmp_path: Path) -> None:
@@ -158,9 +164,9 @@ def test_a_policy_of_another_task_is_not_pushed(tmp_path: Path) -> None:
     learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
     path = tmp_path / "cartpole.npz"
     checkpoint.save_policy(path, ppo.export_parameters(learner), policies.policy_metadata(config))
-    known, rest = render._parse(["--policy", str(path), "--push", "9", "--out", str(tmp_path / "film.mp4")])
-    with pytest.raises(ConfigError, match="--push: a policy of task cartpole"):
-        render.render(known, rest)
+    known, rest = cli_render._parse(["--policy", str(path), "--push", "9", "--out", str(tmp_path / "film.mp4")])
+    with pytest.raises(ConfigError, match="--push: the robot of task cartpole cannot be pushed"):
+        cli_render.render(known, rest)
 
 
 @pytest.mark.parametrize("at_s", [0.1, 0.7])

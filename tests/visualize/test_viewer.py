@@ -10,14 +10,13 @@ import numpy as np
 import psutil
 import pytest
 
+from hasrl_jax.cli import viewer
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.visualize.render import PUSH_S
-from hasrl_jax.visualize.viewer import __main__ as viewer
 from hasrl_jax.visualize.viewer import browser, native
 from hasrl_jax.visualize.viewer.live import MAX_BEHIND_S, Controls, Live, Pace, Push, readout
 from hasrl_jax.visualize.viewer.shapes import shapes
@@ -34,9 +33,9 @@ def live() -> Live:
 
 
 def test_commands_reach_the_policy_at_once(live: Live) -> None:
-    live.advance(Controls(reset=True, forward_m_s=0.4, lateral_m_s=-0.1))
+    live.advance(Controls((0.4, -0.1), reset=True))
     assert live.view().measures["forward_command"] == pytest.approx(0.4)
-    live.advance(Controls(forward_m_s=0.7))
+    live.advance(Controls((0.7,)))
     measures = live.view().measures
     assert (measures["forward_command"], measures["lateral_command"]) == (pytest.approx(0.7), 0.0)
     assert live.view().time_s == pytest.approx(2 * live.step_s)
@@ -53,43 +52,38 @@ def test_pausing_stops_time_but_a_reset_still_acts(live: Live) -> None:
     assert live.view().randomized
 
 
-def test_a_push_gives_its_momentum_and_ends(live: Live) -> None:
-    def lateral_momentum() -> float:
-        env = live._episode.env
-        physics = env._state.physics[0]
-        data = mujoco.MjData(env.task.model)
-        data.qpos[:], data.qvel[:] = np.split(physics[1:], [env.task.model.nq])
-        mujoco.mj_forward(env.task.model, data)
-        mujoco.mj_subtreeVel(env.task.model, data)
-        return float(data.subtree_linvel[0, 1] * env.task.model.body_mass.sum())
-
-    def play(push: Push | None) -> list[float]:
-        live._episode.env.reset(seed=1)
+def test_a_push_is_that_of_the_task_and_ends(live: Live) -> None:
+    def play(push: Push | None) -> list[np.ndarray]:
+        live._episode.player.env.reset(seed=1)
         live.advance(Controls(reset=True))
         live.advance(Controls(push=push))
-        momentum = [lateral_momentum()]
-        for _ in range(round(PUSH_S / live.step_s)):
+        seen = [live.view().qpos]
+        for _ in range(8):
             assert live.view().push == push
             live.advance(Controls())
-            momentum.append(lateral_momentum())
+            seen.append(live.view().qpos)
         assert live.view().push is None
-        return momentum
+        return seen
 
+    env = live._episode.player.env
     alone, pushed = play(None), play(Push(80.0, 90.0))
-    assert pushed[0] - alone[0] == pytest.approx(80.0 * live.step_s, abs=0.3)  # the feet take some of it
-    assert pushed[2] - alone[2] > 2 * 80.0 * live.step_s
+    np.testing.assert_allclose(env._state.task.push[0], [0.0, 0.0], atol=1e-9)  # it is over
+    assert pushed[-1][1] - alone[-1][1] > 0.02  # to the left
+    live.advance(Controls(reset=True, push=Push(80.0, 90.0)))
+    np.testing.assert_allclose(live._episode.player.env._state.task.push[0], [0.0, 80.0], atol=1e-9)
 
 
 def test_falls_begin_another_episode_and_are_counted(live: Live) -> None:
     live.advance(Controls(reset=True))
     before = live.view().falls
     for _ in range(400):  # the parameters are random: it cannot walk
-        live.advance(Controls(forward_m_s=1.0, randomized=True))
+        live.advance(Controls((1.0,), randomized=True))
         if live.view().falls > before:
             break
     assert live.view().falls == before + 1
     assert live.view().randomized
     assert live.view().time_s == 0
+    assert dict(readout(live.view(), live.commands, 1.0))["falls"].endswith("the last episode ended: fell")
 
 
 def test_a_randomised_robot_has_steps_of_its_own(live: Live) -> None:
@@ -104,15 +98,34 @@ def test_a_randomised_robot_has_steps_of_its_own(live: Live) -> None:
 
 
 def test_poses_are_those_of_the_robot(live: Live) -> None:
-    live.advance(Controls(reset=True, forward_m_s=0.3))
+    live.advance(Controls((0.3,), reset=True))
     view = live.view()
     np.testing.assert_allclose(view.position[1], view.qpos[:3])
     np.testing.assert_allclose(view.orientation[1], view.qpos[3:7], atol=1e-9)
 
 
-def test_only_the_walking_task_is_shown() -> None:
-    with pytest.raises(ConfigError, match="cartpole"):
-        Live(from_dict(SMALL | {"task": "cartpole"}), {}, seed=0)
+def test_any_task_is_shown() -> None:
+    config = from_dict(SMALL | {"task": "cartpole"})
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    live = Live(config, ppo.export_parameters(learner), seed=0, randomized=True)
+    live.advance(Controls(randomized=True))
+    assert (live.commands, live.can_push, live.can_randomize, live.view().randomized) == ((), False, False, False)
+    rows = dict(readout(live.view(), live.commands, 1.0))
+    assert float(rows["angle"]) == pytest.approx(live.view().measures["angle"], abs=0.01)
+
+
+def test_the_ground_of_an_episode_is_shown() -> None:
+    stairs = {"kind": "steps", "step_height_m": [0.1, 0.1], "step_depth_m": [0.4, 0.4]}
+    config = from_dict(SMALL | {"cassie": {"terrain": stairs}})
+    task = make_task(config)
+    learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
+    live = Live(config, ppo.export_parameters(learner), seed=0)
+    live.view()
+    boxes = np.flatnonzero((live.model.geom_bodyid == 0) & (live.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX))
+    top = live.model.geom_pos[boxes, 2] + live.model.geom_size[boxes, 2]
+    np.testing.assert_allclose(np.diff(top)[:8], 0.1, atol=1e-9)
+    np.testing.assert_allclose(live.model.geom_size[boxes[1:9], 0], 0.2, atol=1e-9)
 
 
 def test_pace_waits_for_the_clock_and_gives_up_what_it_missed() -> None:
@@ -133,11 +146,11 @@ def test_pace_waits_for_the_clock_and_gives_up_what_it_missed() -> None:
 
 
 def test_the_readout_says_when_it_is_behind(live: Live) -> None:
-    live.advance(Controls(reset=True, forward_m_s=0.4))
-    rows = dict(readout(live.view(), 0.5))
+    live.advance(Controls((0.4,), reset=True))
+    rows = dict(readout(live.view(), live.commands, 0.5))
     assert rows["pace"] == "behind: 50% of real time"
     assert rows["forward"].endswith("of +0.40 m/s")
-    assert dict(readout(live.view(), 1.0))["pace"] == "real time"
+    assert dict(readout(live.view(), live.commands, 1.0))["pace"] == "real time"
 
 
 def test_shapes_have_the_size_that_mujoco_gives_them(live: Live) -> None:
@@ -152,21 +165,21 @@ def test_shapes_have_the_size_that_mujoco_gives_them(live: Live) -> None:
 
 
 def test_keys_of_the_native_window() -> None:
-    keys = native.Keys(randomized=True)
+    keys = native.Keys(make_task(from_dict({})).commands, randomized=True)
     for key in (native.UP, native.UP, native.LEFT, native.SPACE, native.ENTER, 65):
         keys.press(key)
     first = keys.controls()
-    assert first == Controls(0.2, 0.05, paused=True, randomized=True, push=Push(native.PUSH_N, 90.0))
+    assert first == Controls((0.2, 0.05), paused=True, randomized=True, push=Push(native.PUSH_N, 90.0))
     assert keys.controls() == first._replace(push=None)
     for key in (native.SPACE, native.BACKSPACE, native.ENTER, native.DOWN):
         keys.press(key)
     second = keys.controls()
-    assert second == Controls(0.1, 0.05, randomized=True, reset=True, push=Push(native.PUSH_N, -90.0))
+    assert second == Controls((0.1, 0.05), randomized=True, reset=True, push=Push(native.PUSH_N, -90.0))
 
 
 def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
     pytest.importorskip("viser")
-    page = browser.Browser(live.model, port=0, randomized=True)
+    page = browser.Browser(live, port=0, randomized=True)
     try:
         port = int(page.url.rpartition(":")[2])
         listening = [c.laddr for c in psutil.Process().net_connections() if c.status == psutil.CONN_LISTEN]
@@ -178,7 +191,7 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
 
         steps = iter(range(20))
         live.advance(Controls(reset=True))
-        page._forward.value = 0.5
+        page._sliders[0].value = 0.5
         viewer.loop(live, page, Pace(), lambda: next(steps, None) is None)
         view = live.view()
         assert view.time_s == pytest.approx(21 * 0.025)
@@ -186,7 +199,7 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
         np.testing.assert_allclose(page._bodies[1].position, view.position[1])
         np.testing.assert_allclose(page._world.position[:2], -view.position[1, :2])  # the camera follows
         assert "| time |" in page._readout.content
-        assert page.controls() == Controls(forward_m_s=0.5, randomized=True)
+        assert page.controls() == Controls((0.5, 0.0), randomized=True)
         page._push = True
         assert page.controls().push == Push(60.0, 90.0)
         assert page.controls().push is None
@@ -199,7 +212,7 @@ def test_without_viser_one_line_says_what_to_install(
     live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config, path = from_dict(SMALL), tmp_path / "policy.npz"
-    checkpoint.save_policy(path, live._parameters, policies.policy_metadata(config))
+    checkpoint.save_policy(path, live._episode.player._policy.parameters, policies.policy_metadata(config))
     monkeypatch.setitem(sys.modules, "viser", None)
     assert viewer.main(["--policy", str(path)]) == 2
     error = capsys.readouterr().err

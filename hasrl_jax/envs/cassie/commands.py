@@ -1,32 +1,36 @@
 """What an episode draws again and again: commands, and pushes on the pelvis."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hasrl_jax.config.checks import limits_of
 from hasrl_jax.envs.cassie.settings import CommandConfig, PushConfig
 from hasrl_jax.envs.draws import between
 from hasrl_jax.envs.layout import NEGATED, SAME, Entry
+from hasrl_jax.envs.task import Command
 from hasrl_jax.types import Array
 
 PUSH_UNIFORMS = 3  # force, direction, time until the push
 
 
-class Command(NamedTuple):
-    """One thing that a robot can be told."""
+class Told(NamedTuple):
+    """One thing that the robot can be told."""
 
     name: str
     field: str  # of `CommandConfig`: its range
     entry: Entry  # how it stands in the observation
+    measure: str  # that follows it
+    step: float  # of a slider or key
 
 
-FORWARD = Command("forward", "forward_m_s", Entry("forward_command", "m/s", SAME))
-LATERAL = Command("lateral", "lateral_m_s", Entry("lateral_command", "m/s", NEGATED))
-YAW_RATE = Command("yaw_rate", "yaw_rate_rad_s", Entry("yaw_rate_command", "rad/s", NEGATED, std=0.5))
-HEIGHT = Command("height", "height_m", Entry("height_command", "m", SAME, mean=0.9, std=0.1))
+FORWARD = Told("forward", "forward_m_s", Entry("forward_command", "m/s", SAME), "forward_speed", 0.1)
+LATERAL = Told("lateral", "lateral_m_s", Entry("lateral_command", "m/s", NEGATED), "lateral_speed", 0.05)
+YAW_RATE = Told("yaw_rate", "yaw_rate_rad_s", Entry("yaw_rate_command", "rad/s", NEGATED, std=0.5), "yaw_rate", 0.1)
+HEIGHT = Told("height", "height_m", Entry("height_command", "m", SAME, mean=0.9, std=0.1), "height", 0.02)
 # In the order of the numbers in a command.
 COMMANDS = {"world": (FORWARD, LATERAL), "heading": (FORWARD, LATERAL, YAW_RATE, HEIGHT)}
+ARROW_KEYS = {"world": ("up-down", "left-right"), "heading": ("up-down", "", "left-right", "")}
 
 
 def num_uniforms(config: CommandConfig) -> int:
@@ -39,10 +43,21 @@ def named(command: Array, config: CommandConfig) -> dict[str, Array]:
     return {entry.name: command[..., index] for index, entry in enumerate(COMMANDS[config.frame])}
 
 
-def completed(told: Sequence[float], config: CommandConfig, usual_height_m: float) -> list[float]:
-    """A whole command from its first numbers: the others are no speed and the usual height."""
-    rest = [usual_height_m if command is HEIGHT else 0.0 for command in COMMANDS[config.frame]]
-    return [*told, *rest[len(told) :]]
+def declared(config: CommandConfig, usual_height_m: float) -> tuple[Command, ...]:
+    """What the task says of its commands."""
+    return tuple(
+        Command(
+            name=told.name,
+            unit=told.entry.unit,
+            default=usual_height_m if told is HEIGHT else 0.0,
+            drawn=getattr(config, told.field),
+            limits=limits_of(CommandConfig, told.field),
+            measure=told.measure,
+            step=told.step,
+            keys=keys,
+        )
+        for told, keys in zip(COMMANDS[config.frame], ARROW_KEYS[config.frame], strict=True)
+    )
 
 
 def draw_command(uniforms: Array, config: CommandConfig, usual_height_m: float, xp: Any) -> tuple[Array, Array]:
@@ -99,8 +114,6 @@ def next_push(
     push: Array, push_s: Array, elapsed_s: Array, uniforms: Array, config: PushConfig, xp: Any
 ) -> tuple[Array, Array]:
     """The push [..., 2] and the time until it [...] after `elapsed_s`; one that is over gives way to a new draw."""
-    if config.force_n[1] == 0:
-        return push, push_s
     remaining = push_s - elapsed_s
     over = remaining <= -config.duration_s
     drawn, drawn_s = draw_push(uniforms, config, xp)

@@ -2,7 +2,7 @@
 
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.convert import from_dict
-from hasrl_jax.config.files import CONFIG_FOLDER
+from hasrl_jax.config.files import CONFIG_FOLDER, shipped
 from hasrl_jax.config.limits import require
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.config.tasks import TaskSpec
@@ -37,8 +37,19 @@ def check(config: Config) -> None:
 
 
 def undisturbed(config: Config) -> Config:
-    """`config` with the nominal robot and no pushes but those that are asked for."""
-    return from_dict({"cassie": {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}}, config)
+    """`config` with the nominal robot, from rest, and no pushes but those that are asked for."""
+    still = {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}, "command": {"start_moving": 0.0}}
+    return from_dict({"cassie": still}, config)
+
+
+def randomized(config: Config) -> Config:
+    """`config` with a robot drawn anew for every episode."""
+    return from_dict({"cassie": {"randomize": {"enabled": True, "share": 1.0}}}, config)
+
+
+def reference_physics() -> PhysicsConfig:
+    """2 kHz, as in the paper."""
+    return shipped("paper").physics
 
 
 SPEC = TaskSpec(
@@ -47,5 +58,7 @@ SPEC = TaskSpec(
     recipe=CONFIG_FOLDER / "cassie_walk.yaml",
     settings=CassieConfig,
     check=check,
+    reference_physics=reference_physics,
     undisturbed=undisturbed,
+    randomized=randomized,
 )

@@ -122,7 +122,12 @@ def make(config: Config) -> Task:
         mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
         control=control,
-        force=partial(force, constants) if config.settings.push.force_n[1] > 0 else None,
+        force=partial(force, constants),
+        disturbed=config.settings.push.force_n[1] > 0,
+        commands=commands.declared(config.settings.command, config.settings.reward.height_m),
+        with_command=partial(with_command, config.settings),
+        with_push=with_push,
+        push_s=config.settings.push.duration_s,
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )
@@ -287,6 +292,11 @@ def with_command(
     state = state._replace(command=command, command_s=xp.full_like(state.command_s, xp.inf), standing=standing)
     unchanged = observation[..., : places["clock"].start]
     return state, xp.concatenate([unchanged, clock_signal(state, xp), command], axis=-1)
+
+
+def with_push(state: CassieState, force: Array, xp: Any) -> CassieState:
+    """`state` in which a force [..., 2] on the pelvis, along the world's x and y in N, begins to act now."""
+    return state._replace(push=force, push_s=xp.zeros_like(state.push_s))
 
 
 def clock_signal(state: CassieState, xp: Any) -> Array:

@@ -1,1 +1,1 @@
-"""Pictures of how a policy walks: `python -m hasrl_jax.pictures NAME`."""
+"""Pictures of how a policy walks."""

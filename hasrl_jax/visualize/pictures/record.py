@@ -7,9 +7,10 @@ import numpy as np
 from hasrl_jax.config import tasks
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.policy.actor import act, start
+from hasrl_jax.evaluate.rollout import Player
 from hasrl_jax.policy.numpy_networks import Parameters
 
 
@@ -35,21 +36,20 @@ def record(config: Config, parameters: Parameters, speeds: list[float], seconds:
     Raises:
       ConfigError: another task, or an impossible speed.
     """
-    if config.task != "cassie":
+    if not isinstance(config.settings, CassieConfig):
         raise ConfigError(f"task: the pictures show Cassie's gait, and the policy is of {config.task!r}")
     steps_each = max(1, round(seconds / config.physics.env_step_s))
     steps = steps_each * len(speeds)
-    env = TaskEnv(from_dict({"collect": {"max_episode_steps": steps}}, tasks.find(config.task).undisturbed(config)))
-    observation, _ = env.reset(seed=seed)
-    acting = start(config, env.task, parameters, 1)
+    env = TaskEnv(tasks.find(config.task).undisturbed(from_dict({"collect": {"max_episode_steps": steps}}, config)))
+    player = Player(env, parameters, seed)
     rows, terminated = [], False
     for step in range(steps):
         if step % steps_each == 0:
-            observation = env.set_command(speeds[step // steps_each], 0.0)
-        action, acting = act(acting, observation[None], np.array([step == 0]))
-        observation, _, terminated, truncated, info = env.step(action[0])
-        rows.append(info)
-        if terminated or truncated:
+            player.command(speeds[step // steps_each])
+        outcome = player.step()
+        rows.append(outcome.info)
+        terminated = outcome.terminated
+        if outcome.ended:
             break
 
     def columns(prefix: str, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """What an episode earns: every weighted reward term over time, while the commanded speed changes."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,8 +26,10 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
     time_s, measures = recording.time_s, recording.measures
     cycle_s = clock.cycle_seconds(np.mean(SPEEDS_M_S), config.settings.clock, np)
     span = max(1, round(cycle_s / time_s[0]))
-    figure = Figure(figsize=(8.5, 6.4), layout="constrained")
-    panels = figure.subplot_mosaic([["speed", "speed"], *np.reshape(TERMS, (4, 2)).tolist()], sharex=True)
+    rows: list[Any] = [list(TERMS[first : first + 2]) for first in range(0, len(TERMS), 2)]
+    rows[-1] += ["."] * (2 - len(rows[-1]))  # an empty place beside the last of an odd number
+    figure = Figure(figsize=(8.5, 1.6 + 1.2 * len(rows)), layout="constrained")
+    panels = figure.subplot_mosaic([["speed", "speed"], *rows], sharex=True)
     speed = panels["speed"]
     speed.plot(time_s, measures["forward_command"], "--", color=COMMAND, linewidth=1.2, label="commanded")
     speed.plot(time_s, measures["forward_speed"], color=FAINT, linewidth=0.8, label="measured")

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from hasrl_jax.envs.task import Command
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.visualize.viewer.live import Controls, Push, View, readout
+from hasrl_jax.visualize.viewer.live import Controls, Live, Push, View, readout
 from hasrl_jax.visualize.viewer.shapes import shapes
 
 if TYPE_CHECKING:
     import viser
 
 HOST = "127.0.0.1"  # viser's own default would let the whole network in
-FORWARD_M_S = (-0.5, 4.0)
-LATERAL_M_S = (-0.3, 0.3)
 PUSH_N = (10.0, 400.0)
 DIRECTIONS_DEG = {"to the left": 90.0, "to the right": -90.0, "forward": 0.0, "backward": 180.0}
 FLOOR_M = -0.01  # height of the model's floor
 TILE_M = 1.0
+SHOWN_GROUND_M = 5.0  # half size of the boxes of the ground, at most; they are endless to the robot
 READOUT_EVERY = 8  # environment steps
 MISSING = 'the viewer in the browser needs the package viser: pip install "hasrl_jax[viewer]"; or use --native'
 
@@ -32,7 +32,7 @@ class Browser:
     """A page with a panel and a scene; opens on construction.
 
     Args:
-      model: the robot with its visual shapes.
+      live: what is shown.
       port: 0 takes any free one.
       randomized: how the choice of the robot is set at first.
 
@@ -40,7 +40,7 @@ class Browser:
       ConfigError: viser is missing, or the port is in use.
     """
 
-    def __init__(self, model: mujoco.MjModel, port: int, randomized: bool = False):
+    def __init__(self, live: Live, port: int, randomized: bool = False):
         require_viser()
         import viser
 
@@ -49,10 +49,11 @@ class Browser:
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self._lock = threading.Lock()  # viser calls back on threads of its own
         self._reset, self._push = False, False
-        self._shown = 0
+        self._shown, self._episode = 0, 0
         self._origin = np.zeros(3)
-        self._build_panel(randomized)
-        self._build_scene(model)
+        self._model, self._commands = live.model, live.commands
+        self._build_panel(live, randomized)
+        self._build_scene(live.model)
 
     def controls(self) -> Controls:
         """What the panel asks for now; a click counts once."""
@@ -60,10 +61,9 @@ class Browser:
             reset, push = self._reset, self._push
             self._reset, self._push = False, False
         return Controls(
-            forward_m_s=float(self._forward.value),
-            lateral_m_s=float(self._lateral.value),
+            command=tuple(float(slider.value) for slider in self._sliders),
             paused=bool(self._paused.value),
-            randomized=self._robot.value == "randomised",
+            randomized=self._robot is not None and self._robot.value == "randomised",
             reset=reset,
             push=Push(float(self._force.value), DIRECTIONS_DEG[self._direction.value]) if push else None,
         )
@@ -80,8 +80,11 @@ class Browser:
             for body, frame in self._bodies.items():
                 frame.position, frame.wxyz = view.position[body], view.orientation[body]
             self._show_push(view, pelvis)
+            if view.episodes != self._episode:
+                self._episode = view.episodes
+                self._show_ground()
         if self._shown % READOUT_EVERY == 0:
-            rows = "".join(f"| {name} | {value} |\n" for name, value in readout(view, pace))
+            rows = "".join(f"| {name} | {value} |\n" for name, value in readout(view, self._commands, pace))
             self._readout.content = "| | |\n|---|---|\n" + rows
         self._shown += 1
 
@@ -89,34 +92,48 @@ class Browser:
         """Stops serving."""
         self._server.stop()
 
-    def _build_panel(self, randomized: bool) -> None:
+    def _build_panel(self, live: Live, randomized: bool) -> None:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._readout = gui.add_markdown("")
-        with gui.add_folder("Command"):
-            self._forward = gui.add_slider("forward m/s", *FORWARD_M_S, step=0.05, initial_value=0.0)
-            self._lateral = gui.add_slider("left m/s", *LATERAL_M_S, step=0.01, initial_value=0.0)
-        with gui.add_folder("Push"):
-            self._force = gui.add_slider("force N", *PUSH_N, step=10.0, initial_value=60.0)
-            self._direction = gui.add_dropdown("direction", tuple(DIRECTIONS_DEG))
-            push = gui.add_button("push")
+        self._sliders: list[viser.GuiInputHandle[float]] = []
+        if live.commands:
+            with gui.add_folder("Command"):
+                self._sliders = [self._slider(command) for command in live.commands]
+        if live.can_push:
+            with gui.add_folder("Push"):
+                self._force = gui.add_slider("force N", *PUSH_N, step=10.0, initial_value=60.0)
+                self._direction = gui.add_dropdown("direction", tuple(DIRECTIONS_DEG))
+                gui.add_button("push").on_click(self._ask_for_push)
         with gui.add_folder("Episode"):
-            robots = ("nominal", "randomised")
-            hint = "takes effect at the next reset"
-            self._robot = gui.add_dropdown("robot", robots, initial_value=robots[randomized], hint=hint)
+            self._robot = None
+            if live.can_randomize:
+                robots = ("nominal", "randomised")
+                hint = "takes effect at the next reset"
+                self._robot = gui.add_dropdown("robot", robots, initial_value=robots[randomized], hint=hint)
             self._paused = gui.add_checkbox("pause", False)
             self._follow = gui.add_checkbox("camera follows", True)
-            reset = gui.add_button("reset")
+            gui.add_button("reset").on_click(self._ask_for_reset)
 
-        @push.on_click
-        def _(_: object) -> None:
-            with self._lock:
-                self._push = True
+    def _slider(self, command: Command) -> "viser.GuiInputHandle[float]":
+        """A slider over what the policy was trained for; a command that was never drawn stays where it was."""
+        low, high = command.drawn
+        name = f"{command.name.replace('_', ' ')} {command.unit}"
+        step = min(command.step / 2, max(high - low, command.step) / 10)
+        fixed = low == high
+        slider = self._server.gui.add_slider(
+            name, low, high + (step if fixed else 0.0), step=step, initial_value=min(max(command.default, low), high)
+        )
+        slider.disabled = fixed
+        return slider
 
-        @reset.on_click
-        def _(_: object) -> None:
-            with self._lock:
-                self._reset = True
+    def _ask_for_push(self, _: object) -> None:
+        with self._lock:
+            self._push = True
+
+    def _ask_for_reset(self, _: object) -> None:
+        with self._lock:
+            self._reset = True
 
     def _build_scene(self, model: mujoco.MjModel) -> None:
         server, scene = self._server, self._server.scene
@@ -144,6 +161,21 @@ class Browser:
         self._arrow = scene.add_arrows(
             "/world/push", points, (220, 40, 40), shaft_radius=0.02, head_radius=0.05, head_length=0.12, visible=False
         )
+
+    def _show_ground(self) -> None:
+        """The boxes of an episode's ground, where there are any."""
+        boxes = np.flatnonzero((self._model.geom_bodyid == 0) & (self._model.geom_type == mujoco.mjtGeom.mjGEOM_BOX))
+        self._floor.visible = not len(boxes)
+        for number, geom in enumerate(boxes):
+            center, half = self._model.geom_pos[geom], np.minimum(self._model.geom_size[geom], SHOWN_GROUND_M)
+            near = self._model.geom_size[geom][0] <= SHOWN_GROUND_M
+            ahead = np.sign(center[0]) * (self._model.geom_size[geom][0] - half[0])
+            self._server.scene.add_box(
+                f"/world/ground/{number}",
+                color=(200, 200, 200) if number % 2 else (235, 235, 235),
+                dimensions=tuple(2 * half),
+                position=center if near else center - np.array([ahead, 0.0, 0.0]),
+            )
 
     def _show_push(self, view: View, pelvis: np.ndarray) -> None:
         self._arrow.visible = view.push is not None

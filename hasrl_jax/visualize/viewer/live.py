@@ -15,27 +15,26 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import CollectConfig, Config
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.model import load_model
-from hasrl_jax.errors import ConfigError
-from hasrl_jax.policy.actor import Acting, act, start
+from hasrl_jax.envs.task import Command
+from hasrl_jax.evaluate.rollout import Player
 from hasrl_jax.policy.numpy_networks import Parameters
-from hasrl_jax.visualize.render import PUSH_S, SPEED_AVERAGE_S, recent_means
+from hasrl_jax.visualize.render import AVERAGE_S, followed, recent_means
 
 MAX_BEHIND_S = 0.1  # what is missed beyond this is given up, not caught up with
 PACE_WINDOW_S = 1.0  # over which the pace is measured
 
 
 class Push(NamedTuple):
-    """A horizontal force on the whole robot for PUSH_S."""
+    """A horizontal force on the robot, for as long as its task's pushes last."""
 
     force_n: float
-    direction_deg: float  # 0 pushes forward, 90 to the left
+    direction_deg: float  # 0 pushes along the world's x, 90 along its y
 
 
 class Controls(NamedTuple):
     """What a person asks for."""
 
-    forward_m_s: float = 0.0
-    lateral_m_s: float = 0.0
+    command: tuple[float, ...] = ()  # in the order of the task's commands; those that are left out take their default
     paused: bool = False
     randomized: bool = False  # the robot of the next episode
     reset: bool = False  # begin an episode now
@@ -49,117 +48,111 @@ class View(NamedTuple):
     position: np.ndarray  # [nbody, 3] of each body's frame, m
     orientation: np.ndarray  # [nbody, 4] (w, x, y, z)
     time_s: float  # since the episode began
-    measures: dict[str, float]  # means of the task's measures over the last SPEED_AVERAGE_S
+    measures: dict[str, float]  # means of the task's measures over the last AVERAGE_S
+    episodes: int  # that have begun
     falls: int
+    last_end: str  # why the episode before ended; empty before there was one
     push: Push | None  # that acts now
     randomized: bool
 
 
 class Live:
-    """A policy that walks under changing controls, episode after episode.
+    """A policy that acts under changing controls, episode after episode, on the ground that it was trained for.
 
     Args:
-      config: of the policy; its task must be "cassie". The nominal robot is not pushed but by the controls; the
-        randomised one is as `config.settings.randomize` has it. The ground is level, whatever the policy has met.
+      config: of the policy. The nominal robot is not pushed but by the controls.
       parameters: as `learn.ppo.export_parameters` returns them.
       seed: of the environments.
-      randomized: the robot of the first episode.
-
-    Raises:
-      ConfigError: another task.
+      randomized: the robot of the first episode, where the task has randomised ones.
     """
 
     def __init__(self, config: Config, parameters: Parameters, seed: int, randomized: bool = False):
-        if config.task != "cassie":
-            raise ConfigError(f"the viewer commands speeds, and task {config.task!r} has none; give a policy of cassie")
-        longest = limits_of(CollectConfig, "max_episode_steps").high
-        changes = {"collect": {"max_episode_steps": longest}, "cassie": {"terrain": {"kind": "flat"}}}
-        nominal = from_dict(changes, tasks.find(config.task).undisturbed(config))
-        drawn = from_dict({"cassie": {"randomize": {"enabled": True, "share": 1.0}}}, nominal)
-        self._envs = {False: TaskEnv(nominal), True: TaskEnv(drawn)}
-        for env in self._envs.values():
-            env.reset(seed=seed)
-        self._config, self._parameters = nominal, parameters
-        self.model = load_model(self._envs[False].task.asset, config.physics, visual=True)
+        spec, longest = tasks.find(config.task), int(limits_of(CollectConfig, "max_episode_steps").high)
+        nominal = spec.undisturbed(from_dict({"collect": {"max_episode_steps": longest}}, config))
+        self._players = {False: Player(TaskEnv(nominal), parameters, seed)}
+        if spec.randomized:
+            self._players[True] = Player(TaskEnv(spec.randomized(nominal)), parameters, seed)
+        task = self._players[False].env.task
+        self.commands: tuple[Command, ...] = task.commands
+        self.can_push, self.can_randomize = task.with_push is not None, True in self._players
+        self._push_s = task.push_s
+        self.model = load_model(task.asset, config.physics, task.ground, visual=True)
         self._data = mujoco.MjData(self.model)
-        self._falls = 0
+        self._episodes, self._falls, self._last_end = 0, 0, ""
         self._episode = self._begin(randomized)
 
     @property
     def step_s(self) -> float:
         """Duration of an environment step of the running episode, s."""
-        return self._episode.env.step_s
+        return self._episode.player.env.step_s
 
     def advance(self, controls: Controls) -> None:
         """Does what the controls ask for, and one environment step unless they pause."""
         if controls.reset:
+            self._last_end = "reset"
             self._episode = self._begin(controls.randomized)
         episode = self._episode
         if controls.push:
-            episode.push, episode.push_left_s = controls.push, PUSH_S
+            angle = np.deg2rad(controls.push.direction_deg)
+            episode.player.env.push(controls.push.force_n * np.cos(angle), controls.push.force_n * np.sin(angle))
+            episode.push, episode.push_left_s = controls.push, self._push_s
         if controls.paused:
             return
-        command = controls.forward_m_s, controls.lateral_m_s
-        if command != episode.command:
-            episode.observation, episode.command = episode.env.set_command(*command), command
-        _apply_push(episode)
-        is_first = np.array([episode.time_s == 0])
-        action, episode.acting = act(episode.acting, episode.observation[None], is_first)
-        episode.time_s += self.step_s
-        episode.observation, _, terminated, truncated, info = episode.env.step(action[0])
-        episode.recent.append([info[name] for name in episode.env.task.measures])
-        if terminated or truncated:
-            self._falls += terminated
+        if self.commands and controls.command != episode.command:
+            episode.player.command(*controls.command)
+            episode.command = controls.command
+        step_s = self.step_s
+        if episode.push_left_s <= 1e-9:
+            episode.push = None
+        outcome = episode.player.step()
+        episode.time_s += step_s
+        episode.push_left_s -= step_s
+        episode.recent.append([outcome.info[name] for name in episode.player.env.task.measures])
+        if outcome.ended:
+            self._falls += outcome.terminated
+            without_a_fall = "simulation failed" if outcome.info["diverged"] else "time limit"
+            self._last_end = "fell" if outcome.terminated else without_a_fall
             self._episode = self._begin(controls.randomized)
 
     def view(self) -> View:
         """The robot and the readouts as they are now."""
         episode = self._episode
-        self._data.qpos[:] = episode.env.qpos
+        env = episode.player.env
+        env.place_ground(self.model)
+        self._data.qpos[:] = env.qpos
         mujoco.mj_kinematics(self.model, self._data)
         return View(
-            qpos=episode.env.qpos.copy(),
+            qpos=env.qpos.copy(),
             position=self._data.xpos.copy(),
             orientation=self._data.xquat.copy(),
             time_s=episode.time_s,
-            measures=recent_means(episode.env.task.measures, episode.recent),
+            measures=recent_means(env.task.measures, episode.recent),
+            episodes=self._episodes,
             falls=self._falls,
+            last_end=self._last_end,
             push=episode.push,
             randomized=episode.randomized,
         )
 
     def _begin(self, randomized: bool) -> "Episode":
-        env = self._envs[randomized]
-        observation, _ = env.reset()
-        acting = start(self._config, env.task, self._parameters, 1)
-        return Episode(env, randomized, observation, acting, deque(maxlen=round(SPEED_AVERAGE_S / env.step_s)))
+        randomized = randomized and self.can_randomize
+        player = self._players[randomized]
+        player.begin()
+        self._episodes += 1
+        return Episode(player, randomized, deque(maxlen=max(1, round(AVERAGE_S / player.env.step_s))))
 
 
 @dataclass
 class Episode:
     """The running episode of `Live`."""
 
-    env: TaskEnv
+    player: Player
     randomized: bool
-    observation: np.ndarray  # [O] to act on next
-    acting: Acting
-    recent: deque[list[float]]  # the task's measures over the last SPEED_AVERAGE_S
-    command: tuple[float, float] | None = None  # in force, m/s; None before the first
+    recent: deque[list[float]]  # the task's measures over the last AVERAGE_S
+    command: tuple[float, ...] | None = None  # in force; None before the first
     time_s: float = 0.0
     push: Push | None = None
     push_left_s: float = 0.0
-
-
-def _apply_push(episode: Episode) -> None:
-    """Gives the robot the share of the push that falls into the next environment step."""
-    if episode.push_left_s <= 0:
-        episode.push = None
-    if episode.push:
-        step_s = episode.env.step_s
-        momentum = episode.push.force_n * min(episode.push_left_s, step_s)
-        angle = np.deg2rad(episode.push.direction_deg)
-        episode.env.push(momentum * np.cos(angle), momentum * np.sin(angle))
-        episode.push_left_s = round(episode.push_left_s - step_s, 9)  # no sliver of a step from rounding
 
 
 class Pace:
@@ -189,17 +182,21 @@ class Pace:
         return (simulated_last - simulated_first) / (last - first) if last > first else 1.0
 
 
-def readout(view: View, pace: float) -> list[tuple[str, str]]:
+def readout(view: View, commands: tuple[Command, ...], pace: float) -> list[tuple[str, str]]:
     """Names and values to show beside the robot. `pace`: simulated per elapsed time."""
     measures = view.measures
     rows = [("time", f"{view.time_s:.1f} s")]
-    if measures:
-        for name in ("forward", "lateral"):
-            speed, command = measures[f"{name}_speed"], measures[f"{name}_command"]
-            rows.append((name, f"{speed:+.2f} of {command:+.2f} m/s"))
+    shown = {"left_force", "right_force", "motor_power", "phase", "heading"}
+    for command in commands:
+        if command.measure in measures:
+            rows.append((command.name.replace("_", " "), followed(command, measures)))
+            shown |= {command.measure, f"{command.name}_command"}
+    if "left_force" in measures:
         rows.append(("feet", f"left {measures['left_force']:.0f} N, right {measures['right_force']:.0f} N"))
+    if "motor_power" in measures:
         rows.append(("motors", f"{measures['motor_power']:.0f} W"))
-    rows.append(("falls", str(view.falls)))
+    rows += [(name.replace("_", " "), f"{value:+.2f}") for name, value in measures.items() if name not in shown]
+    rows.append(("falls", f"{view.falls}" + (f"; the last episode ended: {view.last_end}" if view.last_end else "")))
     rows.append(("robot", "randomised" if view.randomized else "nominal"))
     rows.append(("pace", "real time" if pace > 0.95 else f"behind: {pace:.0%} of real time"))
     return rows

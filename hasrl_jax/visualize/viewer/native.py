@@ -7,22 +7,27 @@ import time
 
 import mujoco
 
+from hasrl_jax.envs.task import Command
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer.live import Controls, Live, Pace, Push, readout
 
 SPACE, ENTER, BACKSPACE, RIGHT, LEFT, DOWN, UP = 32, 257, 259, 262, 263, 264, 265  # GLFW's key codes
-FORWARD_STEP_M_S = 0.1
-LATERAL_STEP_M_S = 0.05
 PUSH_N = 100.0
-HELP = "arrows: speed; Enter: push; Space: pause; Backspace: reset"
+HELP = "arrows: command; Enter: push; Space: pause; Backspace: reset"
 
 
 class Keys:
-    """Turns pressed keys into controls."""
+    """Turns pressed keys into controls.
 
-    def __init__(self, randomized: bool):
+    Args:
+      commands: of the task; the arrow keys change those that name them.
+      randomized: the robot of the episodes.
+    """
+
+    def __init__(self, commands: tuple[Command, ...], randomized: bool):
+        self._commands = commands
         self._pressed: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._held = Controls(randomized=randomized)
+        self._held = Controls(tuple(command.default for command in commands), randomized=randomized)
         self._next_push = Push(PUSH_N, 90.0)
 
     def press(self, key: int) -> None:
@@ -34,19 +39,21 @@ class Keys:
         held, reset, push = self._held, False, None
         while not self._pressed.empty():
             key = self._pressed.get()
-            forward = {UP: FORWARD_STEP_M_S, DOWN: -FORWARD_STEP_M_S}.get(key, 0.0)
-            lateral = {LEFT: LATERAL_STEP_M_S, RIGHT: -LATERAL_STEP_M_S}.get(key, 0.0)
-            held = held._replace(
-                forward_m_s=round(held.forward_m_s + forward, 3),
-                lateral_m_s=round(held.lateral_m_s + lateral, 3),
-                paused=held.paused ^ (key == SPACE),
-            )
+            held = held._replace(command=self._changed(held.command, key), paused=held.paused ^ (key == SPACE))
             reset = reset or key == BACKSPACE
             if key == ENTER:
                 push = self._next_push
                 self._next_push = push._replace(direction_deg=-push.direction_deg)
         self._held = held
         return held._replace(reset=reset, push=push)
+
+    def _changed(self, told: tuple[float, ...], key: int) -> tuple[float, ...]:
+        """The command after an arrow key, within what the policy was trained for."""
+        direction = {"up-down": {UP: 1, DOWN: -1}, "left-right": {LEFT: 1, RIGHT: -1}, "": {}}
+        return tuple(
+            round(min(max(value + direction[c.keys].get(key, 0) * c.step, c.drawn[0]), c.drawn[1]), 3)
+            for c, value in zip(self._commands, told, strict=True)
+        )
 
 
 def require_display() -> None:
@@ -68,7 +75,7 @@ def show(live: Live, randomized: bool) -> None:
     require_display()
     from mujoco import viewer
 
-    keys, pace, data = Keys(randomized), Pace(), mujoco.MjData(live.model)
+    keys, pace, data = Keys(live.commands, randomized), Pace(), mujoco.MjData(live.model)
     try:
         window = viewer.launch_passive(
             live.model, data, key_callback=keys.press, show_left_ui=False, show_right_ui=False
@@ -84,7 +91,9 @@ def show(live: Live, randomized: bool) -> None:
             with window.lock():
                 data.qpos[:] = view.qpos
                 mujoco.mj_forward(live.model, data)
-            names, values = ("\n".join(column) for column in zip(*readout(view, pace.share()), strict=True))
+            names, values = (
+                "\n".join(column) for column in zip(*readout(view, live.commands, pace.share()), strict=True)
+            )
             window.set_texts((None, None, names, values))
             window.sync()
             time.sleep(pace.wait_s(live.step_s))

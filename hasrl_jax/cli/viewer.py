@@ -1,12 +1,12 @@
-"""The command line of the viewer."""
+"""`hasrl viewer`: watch a policy, command it and push it, in the browser or in MuJoCo's own window."""
 
 import argparse
 import sys
 import time
 from collections.abc import Callable
 
-from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options
+from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config
@@ -21,8 +21,6 @@ def view(arguments: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument, or nothing to show it with; RunError, CheckpointError: no policy.
     """
-    from hasrl_jax.policy.loading import load_policy_parameters, with_physics
-
     known, rest = _parse(arguments)
     check_number("--seed", known.seed, limits_of(Config, "seed"))
     if not 0 <= known.port < 65536:
@@ -32,13 +30,12 @@ def view(arguments: list[str]) -> None:
     else:
         browser.require_viser()
         browser.free_port(known.port)
-    config, parameters = load_policy_parameters(known.run_dir, known.policy)
-    config = cli.override_for_policy(with_physics(config, known.physics), rest, "viewer")
+    config, parameters = policy_to_play(known, rest, "viewer")
     live = Live(config, parameters, known.seed, known.randomized)
     if known.native:
         native.show(live, known.randomized)
         return
-    page = browser.Browser(live.model, known.port, known.randomized)
+    page = browser.Browser(live, known.port, known.randomized)
     try:
         print(f"open {page.url} (this machine only); Ctrl-C ends the viewer", flush=True)
         loop(live, page, Pace(), lambda: False)
@@ -59,7 +56,7 @@ def loop(live: Live, page: browser.Browser, pace: Pace, stop: Callable[[], bool]
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser = OneLineParser(
         prog="python -m hasrl_jax.viewer",
-        description="Watch a policy in the browser, command its speed and push it. Physics and cassie settings can be "
+        description="Watch a policy in the browser, command it and push it. Physics and the task's settings can be "
         "overridden: --cassie.randomize.mass-scale 0.8 1.2",
         allow_abbrev=False,
     )
@@ -72,9 +69,5 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit status."""
-    cli.log_to_terminal()
-    return cli.run(lambda: view(sys.argv[1:] if argv is None else argv))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    log_to_terminal()
+    return run(lambda: view(sys.argv[1:] if argv is None else argv))

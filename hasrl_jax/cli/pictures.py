@@ -1,4 +1,4 @@
-"""The command line of the pictures: draws one by name from a policy."""
+"""`hasrl pictures`: how a policy walks, drawn."""
 
 import argparse
 import io
@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
+from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config
@@ -22,19 +22,16 @@ COLORS = 64
 
 
 def draw(arguments: list[str]) -> None:
-    """The command: loads a policy, plays it, writes the picture.
+    """Loads a policy, plays it, writes the picture.
 
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy.
     """
-    from hasrl_jax.policy.loading import load_policy_parameters, with_physics
-
     known, rest = _parse(arguments)
     check_number("--seed", known.seed, limits_of(Config, "seed"))
     out = known.out or Path(f"{known.name}.png")
     require_writable("--out", out, ".png")
-    config, parameters = load_policy_parameters(known.run_dir, known.policy)
-    config = cli.override_for_policy(with_physics(config, known.physics), rest, "pictures")
+    config, parameters = policy_to_play(known, rest, "pictures")
     save(DRAWINGS[known.name](config, parameters, known.seed), out)
     print(f"{out}: {known.name}")
 
@@ -63,9 +60,5 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit status."""
-    cli.log_to_terminal()
-    return cli.run(lambda: draw(sys.argv[1:] if argv is None else argv))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    log_to_terminal()
+    return run(lambda: draw(sys.argv[1:] if argv is None else argv))
