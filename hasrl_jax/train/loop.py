@@ -10,6 +10,7 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.protocol import Collector, Experience, Networks
@@ -57,6 +58,7 @@ class Part(NamedTuple):
     config: Config
     task: Task
     update: ppo.Update
+    collector: Collector  # only that of the part in which a run begins or goes on is entered
 
 
 def train(
@@ -111,18 +113,17 @@ def make_parts(config: Config, make_update: Callable[..., ppo.Update]) -> list[P
         task = make_task(part_config)
         shares_update = parts and parts[-1].config.ppo == part_config.ppo  # stages change nothing else that it reads
         update = parts[-1].update if shares_update else make_update(part_config, *sizes(task), mesh)
-        parts.append(Part(part_config, task, update))
+        parts.append(Part(part_config, task, update, make_part_collector(part_config, task, mesh)))
     return parts
 
 
-def connect(part: Part) -> Collector:
-    """The collector of a run that begins or goes on with `part`.
+def make_part_collector(config: Config, task: Task, mesh: Mesh) -> Collector:
+    """The collector of one process, or of all together.
 
     Raises:
       ConfigError: the settings do not fit together, or this machine.
     """
-    config, task, _ = part
-    mesh, networks = ppo.make_mesh(), Networks(*make_networks(config.network, *sizes(task)))
+    networks = Networks(*make_networks(config.network, *sizes(task)))
     collector = make_collector(config, task, mesh, networks)
     if config.distributed.num_processes > 1:
         return distributed.SharedExperience(config, collector, mesh)
@@ -150,7 +151,7 @@ def run_iterations(
     learner, progress, env_states = state
     stages = curriculum.Stages(parts[0].config.stages, progress.stage, progress.history)
     collecting = stages.current  # the part whose settings the collector has
-    with connect(parts[collecting]) as collector:
+    with parts[collecting].collector as collector:
         announce(parts[collecting], collector, run.path, progress)
         collector.load(list(env_states))
         while not ended(parts[0].config, progress) and not distributed.any_process(parts[0].config, bool(stop)):
@@ -265,7 +266,7 @@ def due(iteration: int, every: int) -> bool:
 
 def announce(part: Part, collector: Collector, run_dir: Path, progress: Progress) -> None:
     """The first lines of a run: what runs where, and how fast the physics is sampled."""
-    config, task, _ = part
+    config, task, *_ = part
     devices = ", ".join(str(device) for device in jax.devices())
     log.info("task %s, backend %s, schedule %s, learner on %s", config.task, config.backend, config.schedule, devices)
     log.info(

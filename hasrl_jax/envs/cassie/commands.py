@@ -11,6 +11,7 @@ from hasrl_jax.envs.layout import NEGATED, SAME, Entry
 from hasrl_jax.envs.task import Command
 from hasrl_jax.types import Array
 
+ROUNDING_S = 1e-6  # of times that are summed up; far less than a physics step
 PUSH_UNIFORMS = 3  # force, direction, time until the push
 
 
@@ -115,6 +116,6 @@ def next_push(
 ) -> tuple[Array, Array]:
     """The push [..., 2] and the time until it [...] after `elapsed_s`; one that is over gives way to a new draw."""
     remaining = push_s - elapsed_s
-    over = remaining <= -config.duration_s
+    over = remaining <= -config.duration_s + ROUNDING_S
     drawn, drawn_s = draw_push(uniforms, config, xp)
     return xp.where(over[..., None], drawn, push), xp.where(over, drawn_s, remaining)
