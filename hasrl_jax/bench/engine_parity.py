@@ -22,7 +22,7 @@ from hasrl_jax.envs.task import Task
 HORIZONS = (1, 10, 40)  # environment steps
 WARM_UP = 20  # environment steps under random actions, at most, before the comparison
 ACTION_SCALE = 0.3  # standard deviation of the random actions
-SMALLEST_SPREAD = 1e-2  # deviation of an observation, at least, as in the learner's normaliser
+SMALLEST_SPREAD = 1e-2  # standard deviation of an observation, at least, as in the learner's statistics
 NEVER = 2**31 - 1  # no time limit
 
 
@@ -69,10 +69,10 @@ def measure(
     Returns:
       {"settings": {...}, "horizons": {steps: {quantity: {"max", "mean"}, ...}}}, ready for JSON. For every horizon:
       `observation` and every reward term (absolute differences after that many environment steps, or in the last step
-      of an episode that ended before), `observation_relative` and `measures_relative` (to the deviation of each element
-      over the environments), `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m` (likewise, but one step
-      earlier where an episode ended), `still_running` (share of environments that neither engine ended before the
-      horizon) and `termination_agreement` (share that both engines ended at the same step, or not at all).
+      of an episode that ended before), `observation_relative` and `measures_relative` (to the standard deviation of
+      each element over the environments), `loop_error_difference_m`, `loop_error_c_m`, `loop_error_mjx_m` (likewise,
+      but one step earlier where an episode ended), `still_running` (share of environments that neither engine ended
+      before the horizon) and `termination_agreement` (share that both engines ended at the same step, or not at all).
     """
     task = make_task(config)
     rng = np.random.default_rng(seed)
@@ -216,7 +216,7 @@ def compare(task: Task, reference: Recording, ours: Recording, steps: int) -> di
 
 
 def _spread(values: np.ndarray) -> np.ndarray | float:
-    """The deviation of each element over the environments, [N, K] -> [K], and not less than SMALLEST_SPREAD."""
+    """The standard deviation of each element over the environments, [N, K] -> [K]; SMALLEST_SPREAD at least."""
     return np.maximum(values.std(axis=0), SMALLEST_SPREAD) if values.size else 1.0
 
 

@@ -153,6 +153,6 @@ def tables(figures: dict) -> str:
         f"{figures['task']}, {figures['physics']} physics, hidden {figures['hidden']}, symmetric "
         f"{figures['symmetric']}, {steps} environment steps per worker and round, {available_cores()} cores\n\n{speed}"
         "\n\nThe learner's process, per iteration: parameters from the device (export), their copy to shared memory "
-        "and the orders\nto the workers (broadcast), the workers' buffers into one (merge) and into padded "
+        "and the requests\nto the workers (broadcast), the workers' buffers into one (merge) and into padded "
         f"trajectories (pad); memory of a worker,\nin all and what it shares with nobody.\n\n{cost}"
     )

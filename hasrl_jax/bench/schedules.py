@@ -165,7 +165,7 @@ def summary(curve: Curve, target: float) -> dict[str, float | None]:
 
 
 def tables(figures: dict) -> str:
-    """Learning by schedule, mean ± deviation over seeds; then what is hidden."""
+    """Learning by schedule, mean ± standard deviation over seeds; then what is hidden."""
 
     def spread(schedule: str, name: str) -> str:
         values = [run[name] for run in figures["runs"] if run["schedule"] == schedule and run[name] is not None]
@@ -188,11 +188,11 @@ def tables(figures: dict) -> str:
         ["schedule", "collect s", "update s (asleep)", "ideal s", "iteration s", "excess"],
         [[cell["schedule"], *(cell[column] for column in columns)] for cell in figures["hiding"]],
     )
-    return f"{figures['config']}, mean ± deviation over seeds\n\n{learning}\n\n{hiding}"
+    return f"{figures['config']}, mean ± standard deviation over seeds\n\n{learning}\n\n{hiding}"
 
 
 def plot(figures: dict, out: Path) -> None:
-    """Draws the learning curves over environment steps and over seconds: mean, and a band of one deviation.
+    """Draws the learning curves over environment steps and over seconds: mean, and a band of one standard deviation.
 
     A run that has ended keeps its last return, so that slower ones can be drawn to their end.
     """

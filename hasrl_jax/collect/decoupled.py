@@ -1,6 +1,6 @@
 """Workers that wait neither for each other nor for the learner, until both of their slots are full.
 
-A thread of the learner's process gives each worker its next order as soon as it has a free slot, with the newest
+A thread of the learner's process sends each worker its next request as soon as it has a free slot, with the newest
 parameters of that moment, and queues the slots that are finished. The learner takes them oldest first and drops those
 that are too old. Nothing grows: a worker has two slots and one copy of the parameters, all in shared memory.
 Source: paper section V, future work.
@@ -24,7 +24,7 @@ from hasrl_jax.envs.task import Task
 from hasrl_jax.types import Record
 
 POLL_SECONDS = 0.01  # between looks for a slot that the learner has freed, or for the first parameters
-ANSWER_SECONDS = 0.1  # the longest wait for answers, and so for the end
+REPLY_SECONDS = 0.1  # the longest wait for replies, and so for the end
 STREAMS_APART = 2**20  # a run resumed an iteration later draws random numbers so many collections later
 
 
@@ -89,7 +89,7 @@ class FreePool:
         self._pool.load(states)
 
     def publish(self, parameters: dict[str, np.ndarray], version: int) -> None:
-        """Gives the workers newer parameters from their next order on; the arrays must not change afterwards."""
+        """Gives the workers newer parameters from their next request on; the arrays must not change afterwards."""
         with self._changed:
             if self._parameters is None:
                 self._first_stream = version * STREAMS_APART
@@ -149,17 +149,17 @@ class FreePool:
         self._finished = deque(finished for finished in self._finished if finished.version >= oldest)
 
     def _serve(self) -> None:
-        """The thread: orders and answers, until the end or an error, which `take` raises."""
+        """The thread: requests and replies, until the end or an error, which `take` raises."""
         try:
             while not self._closing:
-                self._give_orders()
-                answers = self._pool.answers(list(self._at_work), self._patience())
+                self._send_requests()
+                replies = self._pool.replies(list(self._at_work), self._patience())
                 with self._changed:
-                    for index, answer in answers.items():
+                    for index, reply in replies.items():
                         version = self._at_work.pop(index)
-                        if not isinstance(answer, str):  # else it was replaced and begins this slot anew
+                        if not isinstance(reply, str):  # else it was replaced and begins this slot anew
                             slot = self._pool.slot(index, self._stream(index))
-                            self._finished.append(Finished(index, slot, version, answer))
+                            self._finished.append(Finished(index, slot, version, reply))
                             self._filled[index] += 1
                     self._changed.notify_all()
         except BaseException as error:
@@ -167,7 +167,7 @@ class FreePool:
                 self._error = error
                 self._changed.notify_all()
 
-    def _give_orders(self) -> None:
+    def _send_requests(self) -> None:
         """Sends every worker that has a free slot on its way."""
         with self._changed:
             for index in range(self._plan.num_workers):
@@ -177,7 +177,7 @@ class FreePool:
                         self._pool.configure_worker(index)
                         self._configured[index] = self._settings
                     self._pool.write_parameters(index, self._parameters)
-                    self._pool.order(index, self._stream(index), copy=index)
+                    self._pool.request(index, self._stream(index), copy=index)
                     self._at_work[index] = self._version
 
     def _stream(self, index: int) -> int:
@@ -185,7 +185,7 @@ class FreePool:
         return self._first_stream + self._filled[index]
 
     def _patience(self) -> float:
-        return ANSWER_SECONDS if len(self._at_work) == self._plan.num_workers else POLL_SECONDS
+        return REPLY_SECONDS if len(self._at_work) == self._plan.num_workers else POLL_SECONDS
 
 
 class DecoupledCollector:

@@ -52,7 +52,9 @@ class ActingParameters(NamedTuple):
 
     policy: Any  # parameters of the policy network
     value: Any  # parameters of the value network
-    observation_mean: Array | None  # [O] of the normaliser; None for both where observations are not normalised
+    observation_mean: (
+        Array | None
+    )  # [O] of the observation statistics; None for both where observations are not normalised
     observation_std: Array | None  # [O]
 
 

@@ -92,7 +92,7 @@ class CpuPool:
         self._iteration, self._version, self._started = iteration, version, time.monotonic()
         self.busy = True
         for index in range(self.plan.num_workers):
-            self.order(index, iteration, buffer)
+            self.request(index, iteration, buffer)
 
     def finish(self) -> Collected:
         """Waits for the iteration that `start` asked for and merges the workers' buffers.
@@ -106,12 +106,12 @@ class CpuPool:
         statistics: dict[int, dict[str, Any]] = {}
         cause: str | None = None
         while pending:
-            for index, answer in self.answers(pending, timeout_s=1.0).items():
+            for index, reply in self.replies(pending, timeout_s=1.0).items():
                 pending.discard(index)
-                if isinstance(answer, str):
-                    cause = answer
+                if isinstance(reply, str):
+                    cause = reply
                 else:
-                    statistics[index] = answer
+                    statistics[index] = reply
         self.busy = False
         if not statistics:
             raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
@@ -125,7 +125,7 @@ class CpuPool:
         for name, array in self._block.parameters[copy].items():
             array[:] = parameters[name]
 
-    def order(self, index: int, iteration: int, copy: int) -> None:
+    def request(self, index: int, iteration: int, copy: int) -> None:
         """Asks one worker to fill its slot of an iteration with a copy of the parameters; returns at once."""
         self._block.heartbeat[index] = time.monotonic()
         slot = iteration % shared_memory.NUM_BUFFERS
@@ -135,8 +135,8 @@ class CpuPool:
         """Where a worker writes in an iteration; it does so again two iterations later."""
         return self._block.slots[iteration % shared_memory.NUM_BUFFERS][index]
 
-    def answers(self, indices: Iterable[int], timeout_s: float) -> dict[int, dict[str, Any] | str]:
-        """Waits for any of the workers that were given an order.
+    def replies(self, indices: Iterable[int], timeout_s: float) -> dict[int, dict[str, Any] | str]:
+        """Waits for any of the workers that were sent a request.
 
         Returns:
           By worker: the statistics of one that has finished; how it was lost of one that was, and was replaced.
@@ -144,20 +144,20 @@ class CpuPool:
         Raises:
           WorkerError: one failed too many times in a row.
         """
-        answers: dict[int, dict[str, Any] | str] = {}
+        found: dict[int, dict[str, Any] | str] = {}
         by_connection = {self._workers[index].connection: index for index in indices}
         for ready in wait(list(by_connection), timeout_s):
             index = by_connection[cast(Connection, ready)]
             reply, failure = self._receive(index)
             if failure is None:
-                answers[index] = json.loads(reply)
+                found[index] = json.loads(reply)
                 self._failures[index] = 0
             else:
-                answers[index] = failure
+                found[index] = failure
                 self._replace(index, failure)
-        for index in self._replace_silent(set(by_connection.values()) - answers.keys()):
-            answers[index] = self._silence()
-        return answers
+        for index in self._replace_silent(set(by_connection.values()) - found.keys()):
+            found[index] = self._silence()
+        return found
 
     def save(self) -> list[bytes]:
         """The state of every worker's environments; only between `finish` and `start`.
@@ -167,7 +167,7 @@ class CpuPool:
         states = []
         for index in range(self.plan.num_workers):
             self._send(index, {"do": "save"})
-            state, failure = self._answer(index)
+            state, failure = self._reply_to(index)
             states.append(state)
             if failure is not None:
                 self._replace(index, failure)
@@ -182,7 +182,7 @@ class CpuPool:
         for index, state in enumerate(states):
             self._send(index, {"do": "load"})
             self._send(index, state)
-            reply, failure = self._answer(index)
+            reply, failure = self._reply_to(index)
             if failure is not None:
                 self._replace(index, failure)
             elif state and not json.loads(reply)["loaded"]:
@@ -200,7 +200,7 @@ class CpuPool:
     def configure_worker(self, index: int) -> None:
         """Gives `config`, which has changed, to one worker; it must not be collecting."""
         self._send(index, {"do": "configure", "config": to_dict(self.config)})
-        _, failure = self._answer(index)
+        _, failure = self._reply_to(index)
         if failure is not None:
             self._replace(index, failure)
 
@@ -243,7 +243,7 @@ class CpuPool:
         with contextlib.suppress(OSError):  # it died; its closed connection says so when the reply is awaited
             self._workers[index].connection.send_bytes(data)
 
-    def _answer(self, index: int) -> tuple[bytes, str | None]:
+    def _reply_to(self, index: int) -> tuple[bytes, str | None]:
         """As `_receive`, for a request that is answered at once: a worker that stays silent has failed."""
         if not self._workers[index].connection.poll(self.config.collect.worker_timeout_s):
             return b"", self._silence()
@@ -272,7 +272,7 @@ class CpuPool:
         silent = {
             index
             for index in pending
-            # An answer that waits to be read says that it is alive, however long this process was held up.
+            # A reply that waits to be read says that it is alive, however long this process was held up.
             if time.monotonic() - self._block.heartbeat[index] > limit and not self._workers[index].connection.poll(0)
         }
         for index in silent:

@@ -101,7 +101,7 @@ class PPOConfig:
     discount: Share = 0.97  # gamma
     advantage: Literal["gae", "return"] = "gae"  # GAE, or discounted return minus value (paper Eq. 2)
     gae_lambda: Share = 0.95  # lambda of GAE
-    standardize_advantages: bool = True  # zero mean, unit deviation over the iteration
+    standardize_advantages: bool = True  # zero mean, unit standard deviation over the iteration
     # skip the rest of the policy updates of an iteration beyond this KL; 0 never skips
     max_kl: Annotated[float, Limits(0, 1e6)] = 0.03
     mask_padding: bool = True  # False copies the published losses, which average over padding

@@ -21,7 +21,7 @@ class Entry(NamedTuple):
     mirror: tuple[float, ...]  # sign of each number in the mirror image; its length is the size of the entry
     legs: bool = False  # the numbers are those of the left leg, then those of the right: a mirror swaps the halves
     mean: float = 0.0  # where a policy that never saw the quantity is given it: roughly its mean
-    std: float = 1.0  # and its deviation
+    std: float = 1.0  # and its standard deviation
 
     @property
     def size(self) -> int:

@@ -88,8 +88,8 @@ def correct_for_lag(
       batch: from `prepare_batch`, [B, T, ...].
       params: policy parameters before the update.
       policy: the network.
-      mean: [O] normaliser mean before the update.
-      std: [O] normaliser deviation.
+      mean: [O] mean of the observation statistics before the update.
+      std: [O] their standard deviation.
       version: [] int32, of `params`.
       max_importance: where the weights are cut off.
 
@@ -152,8 +152,8 @@ def policy_loss(
       params: policy parameters.
       policy: the network.
       batch: a minibatch.
-      mean: [O] normaliser mean the collectors used.
-      std: [O] normaliser deviation.
+      mean: [O] mean of the observation statistics the collectors used.
+      std: [O] their standard deviation.
       ppo: coefficients.
 
     Returns:

@@ -75,7 +75,7 @@ class Policy(nn.Module):
 
     With a mirror M the same weights run on the observation and on its mirror image,
         mean(o) = tanh((head(h(o)) + M head(h(M o))) / 2),
-    so that mean(M o) = M mean(o) for any parameters and any normaliser statistics.
+    so that mean(M o) = M mean(o) for any parameters and any observation statistics.
 
     Source: paper II.E (policy representation). Differs from the paper: observation normalisation and the mirror.
     """
@@ -98,7 +98,7 @@ class Policy(nn.Module):
                 )
             )
         self.layers = layers
-        # A small head: the first policy acts near zero, the neutral posture, and explores by its deviation alone.
+        # A small head: the first policy acts near zero, the neutral posture, and its deviation alone explores.
         self.head = (
             self.param("mean_kernel", nn.initializers.orthogonal(0.01), (hidden, self.action_size)),
             self.param("mean_bias", nn.initializers.zeros, (self.action_size,)),
@@ -124,8 +124,8 @@ class Policy(nn.Module):
           observation: [N, O] single states, or [B, T, O] sequences; raw.
           carry: [N or B, L, 2, W] state before the first step (see `zero_carry`); None for zeros.
           is_first: [N] or [B, T] bool, the carry is zeroed before these steps; None for no resets.
-          observation_mean: [O] normaliser mean; None does not normalise.
-          observation_std: [O] normaliser deviation; None does not normalise.
+          observation_mean: [O] mean of the observation statistics; None does not normalise.
+          observation_std: [O] their standard deviation; None does not normalise.
 
         Returns:
           (mean action [N, A] or [B, T, A], carry after the last step, shaped as `carry`).
@@ -140,7 +140,7 @@ class Policy(nn.Module):
         initial = zero_carry(batch, self.hidden_size, self.mirror is not None) if carry is None else carry
         streams = [observation] if self.mirror is None else [observation, self.mirror.observation(observation)]
         count = len(streams)
-        # Streams become neighbours on the batch axis, so a batch split over devices stays where it is.
+        # Streams stand side by side on the batch axis, so a batch split over devices stays where it is.
         inputs = normalize_observation(jnp.stack(streams, axis=1), observation_mean, observation_std)
         inputs = jnp.swapaxes(inputs.reshape(batch * count, steps, -1), 0, 1)  # time-major for the scan
         state = jnp.moveaxis(jnp.reshape(initial, (batch, LSTM_LAYERS, 2, count, -1)), 3, 1)
@@ -215,7 +215,7 @@ def log_std(policy: Policy, params: Parameters) -> jax.Array:
 def values(
     value: Value, params: Parameters, observation: jax.Array, mean: jax.Array | None, std: jax.Array | None
 ) -> jax.Array:
-    """V(s) of raw observations [..., O] under the normaliser's mean and deviation [O]: [...]."""
+    """V(s) of raw observations [..., O] under the observation statistics' mean and standard deviation [O]: [...]."""
     return cast(jax.Array, value.apply({"params": params}, observation, mean, std))
 
 

@@ -31,7 +31,7 @@ from hasrl_jax.types import Mirror, Trajectory
 
 log = logging.getLogger("hasrl_jax")
 Trained = tuple[Parameters, Any]  # parameters and their optimiser state
-Statistics = tuple[jax.Array | None, jax.Array | None]  # mean and deviation of observations, [O] each
+Statistics = tuple[jax.Array | None, jax.Array | None]  # mean and standard deviation of observations, [O] each
 
 _LARGEST_INT32 = 2**31 - 1
 _POLICY_METRICS = (
@@ -181,7 +181,7 @@ class Update:
     def _iteration(
         self, state: LearnerState, trajectory: Trajectory, counts: jax.Array
     ) -> tuple[LearnerState, Metrics]:
-        """Advantages once, then all epochs and minibatches, then the normaliser."""
+        """Advantages once, then all epochs and minibatches, then the observation statistics."""
         self.trace_count += 1
         log.info("compiling the update for %d trajectories of %d steps", *trajectory.reward.shape)
         config, ppo = self.config, self.config.ppo

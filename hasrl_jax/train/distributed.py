@@ -34,7 +34,7 @@ log = logging.getLogger("hasrl_jax")
 SUMS = ("diverged_envs", "workers_lost")
 OWN_SETTINGS = {"run_dir", "distributed.process_id"}  # may differ between the processes
 SHUTDOWN_TIMEOUT_S = 10  # how long a process that ends waits for the others
-ANSWER_TIMEOUT_S = 5.0
+REPLY_TIMEOUT_S = 5.0
 RETRY_S = 0.2
 GO = b"go"
 
@@ -53,7 +53,7 @@ def join(config: Config) -> None:
     if settings.num_processes == 1:
         return
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    meet(settings)
+    barrier(settings)
     jax.distributed.initialize(
         settings.coordinator,
         settings.num_processes,
@@ -72,7 +72,7 @@ def join(config: Config) -> None:
                 raise ConfigError(f"{name}: got {found}; expected the same in all")
 
 
-def meet(settings: DistributedConfig) -> None:
+def barrier(settings: DistributedConfig) -> None:
     """Waits until all processes are there; JAX would end the program with a stack trace when one stays away.
 
     Raises:
@@ -84,19 +84,19 @@ def meet(settings: DistributedConfig) -> None:
     limit = f"within distributed.start_timeout_s={settings.start_timeout_s:g} s"
     try:
         if settings.process_id == 0:
-            _call_roll(settings, (host, int(port)), deadline)
+            _hold_barrier(settings, (host, int(port)), deadline)
         else:
-            _answer_roll(settings, (host, int(port)), deadline)
+            _reach_barrier(settings, (host, int(port)), deadline)
     except TimeoutError as error:
-        raise ConfigError(f"{here}; {error or 'nobody answered'}; expected all processes {limit}") from None
+        raise ConfigError(f"{here}; {error or 'nobody replied'}; expected all processes {limit}") from None
     except OSError as error:
         raise ConfigError(
             f"{here}, which cannot be used ({error.strerror}); expected a free port of process 0"
         ) from None
 
 
-def _call_roll(settings: DistributedConfig, address: tuple[str, int], deadline: float) -> None:
-    """Process 0: lets the others go on when all have come."""
+def _hold_barrier(settings: DistributedConfig, address: tuple[str, int], deadline: float) -> None:
+    """Process 0: lets the others go on when all have reached the barrier."""
     with socket.create_server(address) as server, ExitStack() as stack:
         present: dict[int, socket.socket] = {}
         while len(present) < settings.num_processes - 1:
@@ -105,11 +105,11 @@ def _call_roll(settings: DistributedConfig, address: tuple[str, int], deadline: 
                 connection = stack.enter_context(server.accept()[0])
             except TimeoutError:
                 raise TimeoutError(f"only processes {sorted([0, *present])} came") from None
-            connection.settimeout(ANSWER_TIMEOUT_S)
+            connection.settimeout(REPLY_TIMEOUT_S)
             try:
                 process_id, num_processes = map(int, connection.recv(64).split())
             except (OSError, ValueError):
-                continue  # something else knocked
+                continue  # not one of our processes
             if num_processes != settings.num_processes:
                 seen = f"got {num_processes} in process {process_id} and {settings.num_processes} in process 0"
                 raise ConfigError(f"distributed.num_processes: {seen}; expected the same in all")
@@ -120,7 +120,7 @@ def _call_roll(settings: DistributedConfig, address: tuple[str, int], deadline: 
             connection.sendall(GO)
 
 
-def _answer_roll(settings: DistributedConfig, address: tuple[str, int], deadline: float) -> None:
+def _reach_barrier(settings: DistributedConfig, address: tuple[str, int], deadline: float) -> None:
     """The other processes: wait for process 0."""
     while True:
         left = max(0.01, deadline - time.monotonic())
@@ -132,7 +132,7 @@ def _answer_roll(settings: DistributedConfig, address: tuple[str, int], deadline
                 raise TimeoutError("process 0 does not listen there") from None
             time.sleep(RETRY_S)
     with connection:
-        connection.settimeout(left + ANSWER_TIMEOUT_S)  # process 0 gives up first
+        connection.settimeout(left + REPLY_TIMEOUT_S)  # process 0 gives up first
         connection.sendall(f"{settings.process_id} {settings.num_processes}".encode())
         try:
             answer = connection.recv(len(GO))

@@ -137,7 +137,7 @@ def test_a_process_has_its_share_of_the_plan():
 def meet(address: str, **settings: int) -> str | None:
     """The complaint of a process, if it has one; on one line."""
     try:
-        distributed.meet(DistributedConfig(coordinator=address, **{"start_timeout_s": 20.0, **settings}))
+        distributed.barrier(DistributedConfig(coordinator=address, **{"start_timeout_s": 20.0, **settings}))
     except ConfigError as error:
         complaint = str(error)
     else:

@@ -25,7 +25,7 @@ from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import WorkerError
 
 log = logging.getLogger("hasrl_jax")
-HEARTBEAT = "heartbeat"  # a thread of its own in every worker, which answers while another collects
+HEARTBEAT = "heartbeat"  # a thread of its own in every worker, which replies while another collects
 TICK_S = 1.0
 RAISED = "raised "  # how the failure of a worker begins that is its own
 
@@ -53,8 +53,8 @@ class RayPool:
         self.places: dict[int, tuple[str, int]] = {}  # Ray node and process of each worker that is ready
         self._failures = [0] * plan.num_workers
         self._actors: dict[int, Any] = {}
-        self._starting: dict[Any, int] = {}  # the answer of `RayWorker.place` still to come -> worker
-        self._requests: dict[Any, int] = {}  # the answer of `RayWorker.collect` still to come -> worker
+        self._starting: dict[Any, int] = {}  # the reply of `RayWorker.place` still to come -> worker
+        self._requests: dict[Any, int] = {}  # the reply of `RayWorker.collect` still to come -> worker
         self._version, self._started = -1, 0.0
         specs = shared_memory.worker_slot_specs(config, plan, task.observation_size, task.action_size)
         self.ray = import_ray(config.ray)
@@ -108,9 +108,9 @@ class RayPool:
         while self._requests:
             for request in self.ray.wait(list(self._requests), timeout=TICK_S)[0]:
                 index = self._requests.pop(request)
-                answer, failure = self._receive(index, request)
+                reply, failure = self._receive(index, request)
                 if failure is None:
-                    finished[index] = answer
+                    finished[index] = reply
                     self._failures[index] = 0
                 else:
                     self._replace(index, failure)
@@ -220,7 +220,7 @@ class RayPool:
             raise WorkerError(f"every worker was lost, and no other started within {limit}")
 
     def _receive(self, index: int, request: Any) -> tuple[Any, str | None]:
-        """A worker's answer, and how it failed if it did."""
+        """A worker's reply, and how it failed if it did."""
         try:
             return self.ray.get(request, timeout=self.config.collect.worker_timeout_s), None
         except self.ray.exceptions.GetTimeoutError:
@@ -242,14 +242,14 @@ class RayPool:
         Args:
           pending: workers.
           heard: when each took its last known step; brought up to date.
-          asked: each worker's answer still to come, of `RayWorker.silent_s`; brought up to date.
+          asked: each worker's reply still to come, of `RayWorker.silent_s`; brought up to date.
         """
         now, limit = time.monotonic(), self.config.collect.worker_timeout_s
         for index in pending:
             if index not in asked:
                 asked[index] = self._actors[index].silent_s.options(concurrency_group=HEARTBEAT).remote()
             elif self.ray.wait([asked[index]], timeout=0)[0]:
-                with contextlib.suppress(self.ray.exceptions.RayError):  # the answer to `collect` says so too
+                with contextlib.suppress(self.ray.exceptions.RayError):  # the reply to `collect` says so too
                     heard[index] = max(heard[index], now - self.ray.get(asked[index]))
                 del asked[index]
         return {index for index in pending if now - heard[index] > limit}

@@ -25,7 +25,7 @@ class RayWorker:
         self.last_beat = time.monotonic()
 
     def place(self) -> tuple[str, int]:
-        """The Ray node and the process it runs in; the answer says that it is ready."""
+        """The Ray node and the process it runs in; the reply says that it is ready."""
         import ray
 
         return ray.get_runtime_context().get_node_id(), os.getpid()
