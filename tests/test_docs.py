@@ -12,7 +12,7 @@ from hasrl_jax.config.convert import from_dict
 
 PACKAGE = Path(hasrl_jax.__file__).parent
 ROOT = PACKAGE.parent
-DOCUMENTS = ("docs/architecture.md", "docs/paper_to_code.md", "CONTRIBUTING.md", "README.md")
+DOCUMENTS = ("docs/architecture.md", "docs/paper_to_code.md", "docs/reliability.md", "CONTRIBUTING.md", "README.md")
 FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")
 NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 PLACES = (ROOT, PACKAGE, ROOT / "docs", ROOT / "tests")

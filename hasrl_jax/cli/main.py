@@ -3,7 +3,9 @@
 import difflib
 import importlib
 import os
+import signal
 import sys
+from collections.abc import Callable
 
 # name -> (module with `main(arguments) -> exit status`, one line of help); modules load only when they are run
 PROGRAMS = {
@@ -19,10 +21,33 @@ PROGRAMS = {
 }
 
 
-def run(program: str, arguments: list[str]) -> int:
-    """Runs a program; returns its exit status."""
-    status: int = importlib.import_module(PROGRAMS[program][0]).main(arguments)
-    return status
+def start(program: str, arguments: list[str] | None = None) -> int:
+    """Runs a program; returns its exit status. Until it is loaded, Ctrl-C ends it on one line.
+
+    Args:
+      program: one of PROGRAMS.
+      arguments: default: those of this process.
+    """
+    for descriptor in (0, 1, 2):  # one that is closed would soon be a file of ours, and what is printed would go there
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for name in ("stdout", "stderr"):  # what we import may not expect them to be missing
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (open to the end)
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not signal.SIG_IGN:  # as in the background of a shell
+        signal.signal(signal.SIGINT, _leave)
+    main_of: Callable[[list[str]], int] = importlib.import_module(PROGRAMS[program][0]).main
+    signal.signal(signal.SIGINT, handler)
+    return main_of(sys.argv[1:] if arguments is None else arguments)
+
+
+def _leave(*_: object) -> None:
+    """Ends the process at once: there is nothing to tidy, and an import that is cut short leaves nothing usable."""
+    os.write(2, b"interrupted\n")
+    os._exit(130)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -43,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"did you mean {closest[0]}?" if closest else f"expected one of {', '.join(PROGRAMS)}"
         print(f"error: got {argv[0]!r}; {hint}", file=sys.stderr)
         return 2
-    return run(argv[0], argv[1:])
+    return start(argv[0], argv[1:])
 
 
 if __name__ == "__main__":

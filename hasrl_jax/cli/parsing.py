@@ -7,6 +7,7 @@ import difflib
 import io
 import itertools
 import logging
+import os
 import re
 import sys
 import typing
@@ -126,27 +127,47 @@ def run(job: Callable[[], None]) -> int:
     try:
         job()
     except HasrlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_status
+        return _complain(f"error: {error}", error.exit_status)
     except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+        return _complain(f"error: {error}", 1)
     except MemoryError as error:
-        print(f"error: out of memory ({error or 'no detail'})", file=sys.stderr)
-        return 1
+        return _complain(f"error: out of memory ({error or 'no detail'})", 1)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+        return _complain("interrupted", 130)
+    finally:
+        _leave_streams_writable()
     return 0
+
+
+def _complain(text: str, status: int) -> int:
+    with contextlib.suppress(OSError, ValueError):  # nobody is there to read it
+        print(text, file=sys.stderr)
+    return status
+
+
+def _leave_streams_writable() -> None:
+    """What is still to be written when Python ends must not fail on a pipe or terminal that is gone."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def log_to_terminal() -> None:
     """Shows the program's own messages, and nobody else's, as plain lines on stderr."""
+    logging.raiseExceptions = False  # a terminal that is gone is no reason for a traceback
     logger = logging.getLogger("hasrl_jax")
     logger.setLevel(logging.INFO)
     logger.propagate = False
     if not logger.handlers:
         logger.addHandler(logging.StreamHandler())
+    for handler in logger.handlers:
+        if isinstance(handler, logging.StreamHandler):
+            handler.setStream(sys.stderr)  # which may be another one by now
 
 
 def option_name(argument: str) -> str:

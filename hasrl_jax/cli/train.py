@@ -9,6 +9,7 @@ from hasrl_jax.config import curriculum
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import load_yaml, recipe
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.runs.directory import load_run_config
 from hasrl_jax.train.loop import train
@@ -50,8 +51,25 @@ def parse_train(arguments: list[str]) -> tuple[Config, bool, str | None]:
     config = override(base, rest, "train")
     curriculum.resolve(config)  # refuses stages that cannot work
     if known.resume:
+        _require_same_meaning(base, config)
         config = from_dict({"run_dir": str(known.resume)}, config)
     return config, known.resume is not None, known.init_policy
+
+
+def _require_same_meaning(trained: Config, config: Config) -> None:
+    """Refuses settings under which the parameters of a run would mean something else.
+
+    Raises:
+      ConfigError: names the setting.
+    """
+    for name in ("normalize_observations", "symmetric", "learn_std"):
+        its, ours = getattr(trained.network, name), getattr(config.network, name)
+        if its != ours:
+            raise ConfigError(f"network.{name}: got {ours}; this run has learnt with {its}, so leave it at that")
+    theirs, ours = (make_task(one) for one in (trained, config))
+    if theirs.observation != ours.observation:
+        seen = ", ".join(entry.name for entry in set(theirs.observation) ^ set(ours.observation))
+        raise ConfigError(f"{config.section}: these settings change what the policy sees ({seen}); use --init-policy")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, NamedTuple, cast
@@ -29,12 +30,21 @@ from hasrl_jax.errors import WorkerError
 from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
 
 log = logging.getLogger("hasrl_jax")
-MAX_FAILURES = 3  # of one worker in a row, without a finished iteration in between
+MAX_FAILURES = 3  # of one worker among its last ATTEMPTS requests
+ATTEMPTS = 6
+LONGEST_LOOK_S = 2.0  # time between two looks at the workers that counts; what is more was a pause of this process
 
 
 class _Worker(NamedTuple):
     process: subprocess.Popen
     connection: Connection
+
+
+class Silence(NamedTuple):
+    """How long a worker has given no sign of life while this process was looking."""
+
+    heartbeat: float = 0.0  # the last one that was seen
+    seconds: float = 0.0  # looked at since
 
 
 class CpuPool:
@@ -53,7 +63,10 @@ class CpuPool:
     def __init__(self, config: Config, plan: Plan, task: Task):
         self.config, self.plan = config, plan
         self.workers_lost = 0
-        self._failures = [0] * plan.num_workers
+        # Whether each of the last requests to a worker failed; one that dies again and again must not go unnoticed.
+        self._failures = [deque[bool](maxlen=ATTEMPTS) for _ in range(plan.num_workers)]
+        self._looked_at = time.monotonic()
+        self._silences = [Silence() for _ in range(plan.num_workers)]
         self._workers: list[_Worker] = []
         self._block = shared_memory.open_block(config, plan, task.observation_size, task.action_size)
         self._iteration, self._version = -1, -1
@@ -100,7 +113,7 @@ class CpuPool:
         A worker that dies or falls silent is replaced; only its own part of this iteration is lost.
 
         Raises:
-          WorkerError: no worker finished, or one failed too many times in a row.
+          WorkerError: one failed too many times.
         """
         pending = set(range(self.plan.num_workers))
         statistics: dict[int, dict[str, Any]] = {}
@@ -112,9 +125,14 @@ class CpuPool:
                     cause = reply
                 else:
                     statistics[index] = reply
+            if not pending and not statistics:
+                log.warning(
+                    "every worker was lost in the same iteration, the last one %s; it is collected again", cause
+                )
+                pending = set(range(self.plan.num_workers))
+                for index in sorted(pending):
+                    self.request(index, self._iteration, self._iteration % shared_memory.NUM_BUFFERS)
         self.busy = False
-        if not statistics:
-            raise WorkerError(f"every worker was lost in the same iteration; the last one {cause}")
         finished = sorted(statistics)
         slots = [self.slot(index, self._iteration) for index in finished]
         ordered = [statistics[index] for index in finished]
@@ -151,7 +169,7 @@ class CpuPool:
             reply, failure = self._receive(index)
             if failure is None:
                 found[index] = json.loads(reply)
-                self._failures[index] = 0
+                self._failures[index].append(False)
             else:
                 found[index] = failure
                 self._replace(index, failure)
@@ -245,7 +263,9 @@ class CpuPool:
 
     def _reply_to(self, index: int) -> tuple[bytes, str | None]:
         """As `_receive`, for a request that is answered at once: a worker that stays silent has failed."""
-        if not self._workers[index].connection.poll(self.config.collect.worker_timeout_s):
+        connection = self._workers[index].connection
+        # Asked once more: the time may have passed while this process, and the worker with it, was stopped.
+        if not connection.poll(self.config.collect.worker_timeout_s) and not connection.poll(LONGEST_LOOK_S):
             return b"", self._silence()
         return self._receive(index)
 
@@ -256,7 +276,7 @@ class CpuPool:
             data = worker.connection.recv_bytes()
         except (EOFError, OSError):
             code = worker.process.wait()
-            return b"", f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with status {code}"
+            return b"", f"was killed by {signal_name(-code)}" if code < 0 else f"exited with status {code}"
         if data.startswith(b'{"error"'):
             error = json.loads(data)["error"].rstrip()
             log.warning("worker %d (process %d) failed:\n%s", index, worker.process.pid, error)
@@ -268,13 +288,17 @@ class CpuPool:
 
     def _replace_silent(self, pending: set[int]) -> set[int]:
         """Replaces workers without a heartbeat; returns their indices."""
-        limit = self.config.collect.worker_timeout_s
-        silent = {
-            index
-            for index in pending
-            # A reply that waits to be read says that it is alive, however long this process was held up.
-            if time.monotonic() - self._block.heartbeat[index] > limit and not self._workers[index].connection.poll(0)
-        }
+        now = time.monotonic()
+        looked_s = min(now - self._looked_at, LONGEST_LOOK_S)
+        self._looked_at = now
+        silent = set()
+        for index in pending:
+            before, heartbeat = self._silences[index], float(self._block.heartbeat[index])
+            seconds = before.seconds + looked_s if heartbeat == before.heartbeat else 0.0
+            self._silences[index] = Silence(heartbeat, seconds)
+            # A reply that waits to be read says that it is alive.
+            if seconds > self.config.collect.worker_timeout_s and not self._workers[index].connection.poll(0):
+                silent.add(index)
         for index in silent:
             self._replace(index, self._silence())
         return silent
@@ -289,12 +313,21 @@ class CpuPool:
             old.process.kill()
             old.process.wait()
             self.workers_lost += 1
-            self._failures[index] += 1
-            if self._failures[index] >= MAX_FAILURES:
-                raise WorkerError(f"worker {index} failed {MAX_FAILURES} times in a row; the last one {cause}")
+            self._failures[index].append(True)
+            if sum(self._failures[index]) >= MAX_FAILURES:
+                tries = f"{MAX_FAILURES} times in {len(self._failures[index])} requests"
+                raise WorkerError(f"worker {index} failed {tries}; the last one {cause}")
             self._workers[index] = self._spawn(index)
             try:
                 self._await_ready(index)
                 return
             except WorkerError as error:
                 cause = f"was replaced in vain: {error}"
+
+
+def signal_name(number: int) -> str:
+    """SIGKILL for 9; real-time signals have no name of their own."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

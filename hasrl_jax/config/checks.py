@@ -1,6 +1,7 @@
 """Rejects configurations that cannot work, before anything compiles or starts."""
 
 import dataclasses
+import os
 import typing
 from collections.abc import Iterator
 from typing import Annotated, Any
@@ -8,6 +9,8 @@ from typing import Annotated, Any
 from hasrl_jax.config import tasks
 from hasrl_jax.config.limits import Limits, check_number, require
 from hasrl_jax.config.schema import Config
+
+LONGEST_PATH = 4096  # bytes
 
 
 def check(config: Config) -> None:
@@ -23,6 +26,7 @@ def check(config: Config) -> None:
         works = f"'sync' or 'overlap' with backend {config.backend}{reason}; decoupled needs cpu_pool"
         require(config.schedule != "decoupled", "schedule", config.schedule, works)
     _check_machines(config)
+    _check_path("run_dir", config.run_dir)
     further = tasks.find(config.task).check
     if further:
         further(config)
@@ -46,6 +50,15 @@ def limits_of(settings: type, field: str) -> Limits:
     """The limits of one numeric field of a group of settings."""
     hint = typing.get_type_hints(settings, include_extras=True)[field]
     return next(limits for limits in hint.__metadata__ if isinstance(limits, Limits))
+
+
+def _check_path(name: str, path: str) -> None:
+    """Refuses what no file system takes, before it is tried."""
+    try:
+        fits = len(os.fsencode(path)) < LONGEST_PATH and "\0" not in path
+    except UnicodeEncodeError:
+        fits = False
+    require(fits, name, path, f"a path of less than {LONGEST_PATH} bytes that can be encoded, without a null character")
 
 
 def _check_machines(config: Config) -> None:

@@ -108,7 +108,7 @@ def _tuple(value: Any, args: tuple[Any, ...], path: str) -> tuple[Any, ...]:
 
 def _scalar(value: Any, hint: Any, path: str) -> Any:
     """A number, a truth value or a text."""
-    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-4 as a string
+    if hint is float and isinstance(value, str) and value.isascii():  # YAML 1.1 reads 1e-4 as a string
         with contextlib.suppress(ValueError):
             value = float(value)
     accepted: Any = {float: (int, float), int: int, bool: bool, str: str}[hint]

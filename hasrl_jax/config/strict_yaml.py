@@ -6,7 +6,20 @@ import yaml
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, where plain YAML lets the last one win."""
+    """Refuses a key that stands twice in one mapping, where plain YAML lets the last one win, aliases and tags.
+
+    A page of aliases to aliases unpacks to gigabytes, and a tag asks for a type that the text need not have.
+    """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.constructor.ConstructorError(None, None, "aliases are not supported", event.start_mark)
+        if getattr(event, "tag", None) is not None:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the tag {event.tag} is not supported", event.start_mark
+            )
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()

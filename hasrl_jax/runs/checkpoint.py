@@ -6,6 +6,7 @@ carries SHA-256 digests of its files, checked before they are parsed, and of its
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import logging
@@ -31,6 +32,9 @@ log = logging.getLogger("hasrl_jax")
 # "000000040", and "000000040.1" for a step that was saved again: the new one is complete before the old one goes.
 _STEP_NAME = re.compile(r"(\d{9,})(?:\.(\d+))?")
 _PARTIAL = ".partial"
+_SET_ASIDE = ".damaged"  # ends the name of a step that was found damaged
+# What the machine lacks at present, and says nothing about the files.
+_PASSING = (errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE)
 _FILES_DIGEST = "files.sha256"
 _POLICY_METADATA, _POLICY_DIGEST = "__metadata__", "__sha256__"
 
@@ -98,15 +102,16 @@ def save(
     _prune(directory, step, path, keep)
 
 
-def load(directory: Path, template: LearnerState) -> Loaded:
+def load(directory: Path, template: LearnerState, set_aside: bool = False) -> Loaded:
     """The newest step that is whole; a damaged one is passed over with a warning.
 
     Args:
       directory: as given to `save`.
       template: a learner of the configured sizes; the result has its structure, dtypes and placement.
+      set_aside: rename a damaged step, so that no later save removes it.
 
     Raises:
-      CheckpointError: there is no step, none is whole, or it is of another network.
+      CheckpointError: there is no step, none is whole, it is of another network, or it cannot be read at present.
     """
     try:
         candidates = list(reversed(_saved(directory)))
@@ -120,7 +125,12 @@ def load(directory: Path, template: LearnerState) -> Loaded:
         except CheckpointError:
             raise
         except Exception as error:  # storage raises many kinds for damaged files
+            if _is_passing(error):
+                raise CheckpointError(f"{path}: cannot be read at present: {_reason(error)}") from error
             log.warning("checkpoint %s is damaged and passed over: %s", path, _reason(error))
+            if set_aside:
+                with contextlib.suppress(OSError):
+                    path.rename(path.with_name(f"{path.name}{_SET_ASIDE}"))
     raise CheckpointError(f"{directory}: every checkpoint is damaged; the newest is {candidates[0][2].name}")
 
 
@@ -267,10 +277,25 @@ def _prune(directory: Path, step: int, path: Path, keep: int) -> None:
             shutil.rmtree(other, ignore_errors=True)
 
 
+def _is_passing(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, may be gone the next time: then the files are not to blame."""
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _PASSING):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def _require_space(directory: Path, size: int) -> None:
     """Fails before the storage library starts, whose many writers cannot be stopped cleanly by a full disk."""
+    needed = size + size // 4 + 2**20
+    if not hasattr(os, "posix_fallocate"):  # not Linux
+        free = shutil.disk_usage(directory).free
+        if free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return
     with tempfile.TemporaryFile(dir=directory) as file:
-        os.posix_fallocate(file.fileno(), 0, size + size // 4 + 2**20)
+        os.posix_fallocate(file.fileno(), 0, needed)
 
 
 def _remove_unfinished(directory: Path) -> None:

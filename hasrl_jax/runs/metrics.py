@@ -2,13 +2,14 @@
 
 import contextlib
 import json
+import logging
 import math
 import numbers
 import os
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -20,6 +21,7 @@ from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttr
 from hasrl_jax.errors import RunError
 from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY
 
+log = logging.getLogger("hasrl_jax")
 _COLLECT_METRICS = ("env_steps", "stage", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
 _RATE_WINDOW = 20  # iterations over which the speed behind "time left" is measured
 
@@ -118,7 +120,8 @@ class ProgressPrinter:
         self._total = total_env_steps
         self._history = deque([(time.monotonic(), start_env_steps)], maxlen=_RATE_WINDOW + 1)
         self._bar: Progress | None = None
-        if sys.stdout.isatty():
+        self._lost = False  # nothing can be shown any more
+        if sys.stdout is not None and sys.stdout.isatty():
             columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}")
             # Without a refresh thread, messages of the log are never overwritten in the middle.
             self._bar = Progress(*columns, console=Console(file=sys.stdout, highlight=False), auto_refresh=False)
@@ -138,17 +141,29 @@ class ProgressPrinter:
         self._history.append((time.monotonic(), env_steps))
         left = f"{_clock(self._seconds_left())} left"
         line = progress_line(record)
-        if self._bar is None:
-            print(f"{line} | {left}", flush=True)
-            return
-        self._bar.console.print(line, soft_wrap=True, markup=False)
-        self._bar.update(self._task, completed=min(env_steps, self._total), left=left)
-        self._bar.refresh()
+        with self._whatever_becomes_of_it():
+            if self._bar is None:
+                print(f"{line} | {left}", flush=True)
+                return
+            self._bar.console.print(line, soft_wrap=True, markup=False)
+            self._bar.update(self._task, completed=min(env_steps, self._total), left=left)
+            self._bar.refresh()
 
     def close(self) -> None:
         """Gives the terminal back."""
         if self._bar is not None:
-            self._bar.stop()
+            with self._whatever_becomes_of_it():
+                self._bar.stop()
+
+    @contextlib.contextmanager
+    def _whatever_becomes_of_it(self) -> Iterator[None]:
+        """A terminal that is gone, a pipe that nobody reads any more or a full disk must not end the training."""
+        try:
+            yield
+        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+            if not self._lost:
+                log.warning("the progress cannot be shown (%s); training goes on, and metrics.jsonl has it all", error)
+            self._lost, self._bar = True, None
 
     def _seconds_left(self) -> float | None:
         (first_time, first_steps), (last_time, last_steps) = self._history[0], self._history[-1]

@@ -2,7 +2,7 @@
 
 import sys
 
-from hasrl_jax.cli.train import main
+from hasrl_jax.cli.main import start
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start("train"))

@@ -18,13 +18,13 @@ from hasrl_jax.config import curriculum
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
-from hasrl_jax.errors import DivergenceError, LearnerError, WorkerError
+from hasrl_jax.errors import CheckpointError, DivergenceError, LearnerError, RunError, WorkerError
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.runs.directory import RunDirectory, open_run, write_config
+from hasrl_jax.runs.directory import CONFIG_FILE, RunDirectory, open_run, write_config
 from hasrl_jax.runs.metrics import MetricsWriter, NullLogger, ProgressPrinter
 from hasrl_jax.train import distributed
 from hasrl_jax.train.devices import prepare_jax
@@ -75,27 +75,37 @@ def train(
       init_policy: a policy file, a run directory or "released", whose parameters a new run starts from.
       make_update: makes the learner's program; benchmarks put another in its place.
     """
-    prepare_jax(config)
-    distributed.join(config)
+    with stop_signal() as stop:
+        prepare_jax(config)
+        distributed.join(config)
+        parts = make_parts(config, make_update)  # also refuses what cannot work
+        learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
+        if init_policy:
+            learner = policies.with_parameters(learner, policies.load_initial(config, init_policy))
+        with distributed.ending_together(config), open_run(config, resume) as run:
+            _run(parts, RunState(learner), run, resume, stop)
+
+
+def _run(parts: list[Part], state: RunState, run: RunDirectory, resume: bool, stop: "Stop") -> None:
+    """Trains in an open run directory."""
+    config = parts[0].config
     reports = config.distributed.process_id == 0
-    parts = make_parts(config, make_update)  # also refuses what cannot work
-    learner = ppo.init_learner(config, *sizes(parts[0].task), jax.random.key(config.seed))
-    if init_policy:
-        learner = policies.with_parameters(learner, policies.load_initial(config, init_policy))
-    state = RunState(learner)
-    with distributed.ending_together(config), open_run(config, resume) as run, stop_signal() as stop:
-        if resume:
-            loaded = checkpoint.load(run.checkpoints, learner)
-            state = RunState(loaded.learner, progress_from(loaded.extra, config), loaded.blobs)
-            if reports:
-                write_config(run.path, config)  # some settings may differ from now on
-        else:
+    if resume:
+        loaded = checkpoint.load(run.checkpoints, state.learner, set_aside=reports)
+        state = RunState(loaded.learner, progress_from(loaded.extra, config), loaded.blobs)
+        if reports:
+            write_config(run.path, config)  # some settings may differ from now on
+    else:
+        try:
             save(config, run.checkpoints, state)  # whatever happens now, --resume has a beginning
-        with (
-            MetricsWriter(run.path, state.progress.iteration) if reports else NullLogger() as writer,
-            ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else NullLogger() as printer,
-        ):
-            state = run_iterations(parts, state, run, stop, [writer.write, printer.update])
+        except CheckpointError:
+            (run.path / CONFIG_FILE).unlink(missing_ok=True)  # it holds no run yet: the same command may be given again
+            raise
+    with (
+        MetricsWriter(run.path, state.progress.iteration) if reports else NullLogger() as writer,
+        ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else NullLogger() as printer,
+    ):
+        state = run_iterations(parts, state, run, stop, [writer.write, printer.update])
     progress = state.progress
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
 
@@ -165,7 +175,7 @@ def run_iterations(
             try:
                 experience = collector.finish()
             except WorkerError:
-                save(config, run.checkpoints, RunState(learner, progress))
+                save_what_is_finished(config, run.checkpoints, RunState(learner, progress))
                 raise
             progress = progress._replace(env_steps=progress.env_steps + experience.env_steps)
             goes_on = not ended(config, progress) and not stop and not stages.due(progress.env_steps)
@@ -187,8 +197,12 @@ def run_iterations(
             due_for_evaluation = due(progress.iteration, config.evaluate.every_iterations)
             if config.distributed.process_id == 0 and (due_for_evaluation or ended(config, progress)):
                 record |= evaluation_record(config, part.task, learner)
-            for give in report:
-                give(record)
+            try:
+                for give in report:
+                    give(record)
+            except RunError:
+                save_what_is_finished(config, run.checkpoints, RunState(learner, progress))
+                raise
             if distributed.first_process(config, stages.advance(progress.env_steps, record)):
                 log.info("stage %d begins at %s environment steps", stages.current, f"{progress.env_steps:,}")
             progress = progress._replace(stage=stages.current, history=stages.history)
@@ -257,6 +271,14 @@ def save(config: Config, directory: Path, state: RunState) -> None:
     keep = config.checkpoint.keep
     if config.distributed.process_id == 0:
         checkpoint.save(directory, progress.iteration, learner, progress._asdict(), list(env_states), keep)
+
+
+def save_what_is_finished(config: Config, directory: Path, state: RunState) -> None:
+    """A checkpoint on the way out; that it fails, too, must not hide why the run ends."""
+    try:
+        save(config, directory, state)
+    except CheckpointError as error:
+        log.warning("%s", error)
 
 
 def due(iteration: int, every: int) -> bool:

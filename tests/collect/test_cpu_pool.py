@@ -137,22 +137,38 @@ def test_saving_survives_a_lost_worker(make_pool, parameters, number):
     assert len(run(pool, parameters, 1).statistics) == 2
 
 
-def test_when_every_worker_raises_the_cause_is_in_the_error(make_pool, parameters, caplog):
+def test_when_every_worker_raises_again_and_again_the_cause_is_in_the_error(make_pool, parameters, caplog):
     pool = make_pool()
-    with pytest.raises(WorkerError, match=r"(?s)every worker was lost.*DivergenceError: .*not finite"):
+    with pytest.raises(WorkerError, match=r"failed 3 times in 3 requests; .*DivergenceError: .*not finite"):
         run(pool, parameters | {"policy/mean_bias": np.full(1, np.nan)})
-    assert caplog.text.count("Traceback") == 2
-    assert len(run(pool, parameters, 1).statistics) == 2
+    assert caplog.text.count("every worker was lost in the same iteration") == 2
+    assert caplog.text.count("Traceback") >= 5
 
 
-def test_a_worker_that_keeps_failing_ends_in_one_error(make_pool, parameters):
-    pool = make_pool()
-    for iteration in range(cpu_pool.MAX_FAILURES - 1):
+def test_an_iteration_in_which_every_worker_is_lost_is_collected_again(make_pool, parameters, caplog):
+    pool, other = make_pool(), make_pool()
+    pool.start(parameters, 0, version=0)
+    for process_id in pool.process_ids:
+        os.kill(process_id, signal.SIGKILL)
+    again, expected = pool.finish(), run(other, parameters, 0)
+    assert pool.workers_lost == 2
+    np.testing.assert_array_equal(again.fields["observation"], expected.fields["observation"])
+
+
+@pytest.mark.parametrize("iterations_between", [0, 1])
+def test_a_worker_that_keeps_failing_ends_in_one_error(make_pool, parameters, iterations_between):
+    """Also one that finishes an iteration before it dies again."""
+    pool, iteration = make_pool(), 0
+    for failure in range(cpu_pool.MAX_FAILURES):
         os.kill(pool.process_ids[0], signal.SIGKILL)
+        if failure < cpu_pool.MAX_FAILURES - 1:
+            for _ in range(1 + iterations_between):
+                run(pool, parameters, iteration)
+                iteration += 1
+    requests = cpu_pool.MAX_FAILURES + iterations_between * (cpu_pool.MAX_FAILURES - 1)
+    cause = rf"^worker 0 failed 3 times in {requests} requests; the last one was killed by SIGKILL$"
+    with pytest.raises(WorkerError, match=cause):
         run(pool, parameters, iteration)
-    os.kill(pool.process_ids[0], signal.SIGKILL)
-    with pytest.raises(WorkerError, match="worker 0 failed 3 times in a row; the last one was killed by SIGKILL"):
-        run(pool, parameters, cpu_pool.MAX_FAILURES)
 
 
 def test_a_replacement_that_does_not_start_is_tried_again(make_pool, parameters, monkeypatch, caplog):

@@ -119,5 +119,5 @@ def test_one_worker_goes_on_while_the_other_hangs(make_pool, parameters):
 def test_a_worker_that_keeps_failing_is_an_error_of_the_learner(make_pool, parameters, caplog):
     pool = make_pool()
     pool.publish(parameters | {"policy/mean_bias": np.full(1, np.nan)}, 0)
-    with pytest.raises(WorkerError, match=rf"failed {MAX_FAILURES} times in a row.*DivergenceError"):
+    with pytest.raises(WorkerError, match=rf"failed {MAX_FAILURES} times in \d requests.*DivergenceError"):
         pool.take(0, wait=True)

@@ -150,6 +150,17 @@ def test_only_an_empty_file_means_the_defaults(text, tmp_path):
         ("seed: 2020-13-45", "not valid YAML"),
         ("seed: " + "[" * 5000, "not valid YAML"),
         ("ppo: {clip: 1.0e+400}", "ppo.clip"),
+        ("a: &a [1]\nb: *a", "aliases are not supported"),
+        ("seed: !!bool yes please", "the tag tag:yaml.org,2002:bool is not supported"),
+        ("seed: !!timestamp x", "the tag tag:yaml.org,2002:timestamp is not supported"),
+        ('seed: !!int ""', "the tag tag:yaml.org,2002:int is not supported"),
+        ('ppo: {clip: !!float ""}', "the tag tag:yaml.org,2002:float is not supported"),
+        ("!!map [a]", "the tag tag:yaml.org,2002:map is not supported"),
+        ("ppo: !!set [a]", "the tag tag:yaml.org,2002:set is not supported"),
+        ("seed: !!python/object/apply:os.getcwd []", "is not supported"),
+        ('run_dir: "a\\0b"', "run_dir: got"),
+        ("run_dir: " + "x" * 5000, "run_dir: got"),
+        ("ppo: {clip: \uff11e-1}", "ppo.clip: got"),
         ("task: " + "x" * 5000, "task: got"),
     ],
 )
@@ -190,3 +201,38 @@ def test_a_configuration_goes_through_pickle_and_copy():
     stages = [{"at_env_steps": 9, "set": {"ppo.clip": 0.1}}]
     config = from_dict({"seed": 5, "cassie": {"push": {"force_n": [0, 10]}}, "stages": stages})
     assert pickle.loads(pickle.dumps(config)) == copy.deepcopy(config) == config
+
+
+def test_a_page_of_aliases_does_not_unpack_to_gigabytes(tmp_path):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join(lines))
+    with pytest.raises(ConfigError, match="aliases are not supported"):
+        load_yaml(path)
+
+
+def test_surrogates_in_a_path_are_refused():
+    with pytest.raises(ConfigError, match=r"^run_dir: got"):
+        check(from_dict({"run_dir": "\ud800"}))
+
+
+def test_a_file_extends_another_group_by_group(tmp_path):
+    (tmp_path / "base.yaml").write_text("extends: smoke\nseed: 4\nppo: {clip: 0.3, epochs: 7}\n")
+    (tmp_path / "mine.yaml").write_text("extends: base.yaml\nppo: {epochs: 9}\n")
+    mine = load_yaml(tmp_path / "mine.yaml")
+    assert (mine.seed, mine.ppo.clip, mine.ppo.epochs) == (4, 0.3, 9)
+    assert mine.network.hidden_size == shipped("smoke").network.hidden_size
+    (tmp_path / "base.yaml").write_text("extends: mine.yaml\n")
+    with pytest.raises(ConfigError, match=r"base.yaml.extends: got 'mine.yaml', which extends this file itself"):
+        load_yaml(tmp_path / "mine.yaml")
+    (tmp_path / "base.yaml").write_text("extends: 5\n")
+    with pytest.raises(ConfigError, match=r"base.yaml.extends: got 5; expected a file, or a name in configs/"):
+        load_yaml(tmp_path / "mine.yaml")
+
+
+def test_a_shipped_file_is_named_from_anywhere_and_a_wrong_name_lists_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_yaml("smoke") == shipped("smoke")
+    with pytest.raises(ConfigError, match=r"--config smok: cannot be read .*shipped are cartpole, .*smoke"):
+        load_yaml("smok")

@@ -1,5 +1,6 @@
 """Checkpoints are exact, whole or refused, and a failed save harms nothing."""
 
+import errno
 import json
 import logging
 import os
@@ -214,6 +215,47 @@ def test_directory_that_cannot_be_made(tmp_path: Path, learner: LearnerState) ->
     (tmp_path / "file").write_text("")
     with pytest.raises(CheckpointError, match=f"{tmp_path}/file/checkpoints: cannot save step 1: Not a directory"):
         checkpoint.save(tmp_path / "file" / "checkpoints", 1, learner, {}, [], keep=1)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.EMFILE, errno.ENOMEM])
+def test_what_cannot_be_read_at_present_is_not_taken_for_damaged(
+    directory: Path, learner: LearnerState, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = Path.read_bytes
+
+    def fail(path: Path) -> bytes:
+        if "000000002" in str(path):
+            raise OSError(number, os.strerror(number))
+        return read(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_bytes", fail)
+        with pytest.raises(CheckpointError, match=f"000000002: cannot be read at present: {os.strerror(number)}$"):
+            checkpoint.load(directory, learner, set_aside=True)
+    assert checkpoint.load(directory, learner).step == 2
+
+
+def test_a_damaged_step_is_set_aside_and_no_save_removes_it(directory: Path, learner: LearnerState) -> None:
+    newest = directory / "000000002"
+    digest = newest / "files.sha256"
+    digest.write_text("0" * 64)
+    assert checkpoint.load(directory, learner).step == 1
+    assert newest.is_dir(), "reading alone changes nothing"
+    assert checkpoint.load(directory, learner, set_aside=True).step == 1
+    checkpoint.save(directory, 2, learner, {}, [], keep=1)
+    names = sorted(path.name for path in directory.iterdir())
+    assert names == ["000000002", "000000002.damaged"]
+
+
+def test_without_fallocate_the_space_is_asked_for(
+    tmp_path: Path, learner: LearnerState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "posix_fallocate")
+    checkpoint.save(tmp_path, 1, learner, {}, [], keep=1)
+    assert checkpoint.load(tmp_path, learner).step == 1
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 99, 1))
+    with pytest.raises(CheckpointError, match="cannot save step 2: No space left on device"):
+        checkpoint.save(tmp_path, 2, learner, {}, [], keep=1)
 
 
 SAVE_FOR_EVER = """
