@@ -22,7 +22,11 @@ from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.directory import CHECKPOINTS_DIRECTORY, load_run_config
 
 _FOLDER = Path(__file__).parent / "released"
-RELEASED = {"released": _FOLDER / "cassie_walk.npz", "released-stairs": _FOLDER / "cassie_stairs.npz"}
+RELEASED = {
+    "released": _FOLDER / "cassie_walk.npz",
+    "released-steer": _FOLDER / "cassie_steer.npz",
+    "released-stairs": _FOLDER / "cassie_stairs.npz",
+}
 
 
 def load_policy_parameters(
@@ -46,7 +50,7 @@ def load_policy_parameters(
     source = policy or "released"
     path = RELEASED.get(str(source), Path(source))
     if not path.exists():
-        raise CheckpointError(f"{path}: there is no such file; expected a policy file, {' or '.join(RELEASED)}")
+        raise CheckpointError(f"{path}: there is no such file; expected a policy file, or one of {', '.join(RELEASED)}")
     return _from_file(path)
 
 

@@ -48,6 +48,24 @@ def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
     assert not rollout.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
 
 
+def test_the_policy_that_steers_turns_sidesteps_and_crouches_as_it_is_told() -> None:
+    config, parameters = policies.load_policy_parameters(None, "released-steer")
+    told = {"forward_m_s": 0.8, "lateral_m_s": 0.2, "yaw_rate_rad_s": 0.4, "height_m": 0.8}
+    command = {name: [value, value] for name, value in told.items()} | {"resample_s": [0, 0], "start_moving": 0.0}
+    command |= dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0)
+    command |= {"height_probability": 1.0, "height_fade_m_s": [5.0, 6.0]}
+    changes = {"cassie": {"command": command, "randomize": {"enabled": False}}, "collect": {"max_episode_steps": 320}}
+    config = from_dict(changes, config)
+    task = make_task(config)
+    episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
+    assert episodes.reached_cap.all()
+    settled = {name: values[160:].mean() for name, values in statistics.columns(episodes, task).items()}
+    assert settled["forward_speed"] == pytest.approx(0.8, abs=0.15)
+    assert settled["lateral_speed"] == pytest.approx(0.2, abs=0.1)
+    assert settled["yaw_rate"] == pytest.approx(0.4, abs=0.1)
+    assert settled["height"] == pytest.approx(0.8, abs=0.05)
+
+
 def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "policy.npz"
     small = ["--collect.envs-per-worker", "2", "--collect.env-steps-per-iteration", "256", "--num-workers", "1"]
