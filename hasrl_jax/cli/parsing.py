@@ -163,11 +163,8 @@ def log_to_terminal() -> None:
     logger = logging.getLogger("hasrl_jax")
     logger.setLevel(logging.INFO)
     logger.propagate = False
-    if not logger.handlers:
-        logger.addHandler(logging.StreamHandler())
-    for handler in logger.handlers:
-        if isinstance(handler, logging.StreamHandler):
-            handler.setStream(sys.stderr)  # which may be another one by now
+    others = [handler for handler in logger.handlers if type(handler) is not logging.StreamHandler]
+    logger.handlers = [*others, logging.StreamHandler()]  # sys.stderr may be another one by now
 
 
 def option_name(argument: str) -> str:
