@@ -117,7 +117,7 @@ class CpuEnvs:
         if not np.isfinite(action).all():
             raise DivergenceError("the policy produced an action that is not finite")
         task = self.task
-        physics, reading, diverged = self._simulate(state, task.control(state.task, action, np))
+        physics, reading, diverged = self._simulate(state, self._control(state, action))
         result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)
         episode_step = state.episode_step + 1
         terminated = result.terminated & ~diverged
@@ -137,14 +137,25 @@ class CpuEnvs:
         ended = np.flatnonzero(terminated | truncated | diverged)
         return (self._reset_some(state, ended, rng) if len(ended) else state), step_result
 
+    def _control(self, state: EnvState, action: np.ndarray) -> np.ndarray:
+        """Controls of the physics steps of an environment step, [E, S, nu], or [E, 1, nu] where all are the same."""
+        task = self.task
+        control = task.control(state.task, action, np)[:, None]
+        if task.delay is None:
+            return control
+        earlier, delay_s = task.delay(state.task, np)
+        delay_steps = delay_s / state.model_fields.get("timestep", self._timestep)
+        late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
+        return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
+
     def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[np.ndarray, Reading, np.ndarray]:
-        """Runs the physics steps of one environment step.
+        """Runs the physics steps of one environment step under `control`, [E, S or 1, nu].
 
         Returns:
           The physics state, what the task reads of it, and which simulations diverged, [E] bool.
         """
         task, model = self.task, self.task.model
-        self._controls[:, :, : model.nu] = control[:, None]
+        self._controls[:, :, : model.nu] = control
         if self._force:
             self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
         cpu = time.process_time()

@@ -22,6 +22,7 @@ class Entry(NamedTuple):
     legs: bool = False  # the numbers are those of the left leg, then those of the right: a mirror swaps the halves
     mean: float = 0.0  # where a policy that never saw the quantity is given it: roughly its mean
     std: float = 1.0  # and its standard deviation
+    noise: float = 0.0  # half width of the uniform error of a noisy measurement, in the unit
 
     @property
     def size(self) -> int:
@@ -31,6 +32,11 @@ class Entry(NamedTuple):
 def size(entries: Sequence[Entry]) -> int:
     """Numbers in the whole vector."""
     return sum(entry.size for entry in entries)
+
+
+def noise(entries: Sequence[Entry]) -> np.ndarray:
+    """Half width of the error of each number when measurements are noisy, [N]."""
+    return np.concatenate([np.full(entry.size, entry.noise) for entry in entries])
 
 
 def places(entries: Sequence[Entry]) -> dict[str, slice]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from hasrl_jax.envs import motors
 from hasrl_jax.envs.cpu_engine import StepResult
 from hasrl_jax.envs.mjx_physics import Loops, find_loops, mjx, physics_step
 from hasrl_jax.envs.task import Reading, Task
@@ -51,6 +52,7 @@ class MjxEngine:
     model: mjx.Model  # the nominal robot
     data: mjx.Data  # blank: a physics step overwrites all that matters
     loops: Loops
+    curve: motors.Curve | None  # of its motors, where the physics step has to add it
 
     def reset(self, key: Array) -> MjxEnvState:
         """A fresh episode. `key`: [2] uint32; the environment draws everything from it, now and later."""
@@ -97,7 +99,7 @@ class MjxEngine:
         """As `step`, but from given uniform numbers [task.step_uniforms] and without a reset at the end."""
         task = self.task
         with jax.default_matmul_precision("highest"):  # TF32 would cost the physics three digits
-            reading, overflow = self.simulate(state, task.control(state.task, action, jnp))
+            reading, overflow = self.simulate(state, self.control(state, action))
             outcome = task.step(state.task, action, reading, uniforms, jnp)
         finite = [_all_moderate(x) for x in (*reading, outcome.observation, outcome.reward_terms, outcome.measures)]
         diverged = ~jnp.all(jnp.stack(finite))
@@ -124,21 +126,35 @@ class MjxEngine:
         )
         return next_state, result
 
-    def simulate(self, state: MjxEnvState, control: Array) -> tuple[Reading, Array]:
-        """The physics steps of one environment step under constant control [nu]; also the overflow flags [2]."""
-        task, model = self.task, _with_fields(self.model, state.model_fields)
+    def control(self, state: MjxEnvState, action: Array) -> Array:
+        """Controls of the physics steps of an environment step, [S, nu]."""
+        task, steps = self.task, self.task.steps_per_env_step
+        control = jnp.broadcast_to(task.control(state.task, action, jnp), (steps, task.model.nu))
+        if task.delay is None:
+            return control
+        earlier, delay_s = task.delay(state.task, jnp)
+        delay_steps = delay_s / state.model_fields.get("timestep", task.model.opt.timestep)
+        late = jnp.arange(steps) + 0.5 < delay_steps
+        return jnp.where(late[:, None], task.control(state.task, earlier, jnp), control)
 
-        def advance_and_sum(carry: tuple[mjx.Data, Array], _: None) -> tuple[tuple[mjx.Data, Array], None]:
+    def simulate(self, state: MjxEnvState, control: Array) -> tuple[Reading, Array]:
+        """The physics steps of one environment step under `control` [S, nu]; also the overflow flags [2]."""
+        task, fields = self.task, state.model_fields
+        if self.curve and "actuator_gainprm" in fields:
+            fields = fields | motors.pd_parameters(fields["actuator_gainprm"], jnp)
+        model = _with_fields(self.model, fields)
+
+        def advance_and_sum(carry: tuple[mjx.Data, Array], control: Array) -> tuple[tuple[mjx.Data, Array], None]:
             data, total = carry
-            data = physics_step(model, data, self.loops)
+            data = physics_step(model, data.replace(ctrl=control), self.loops, self.curve)
             return (self._keep(data), total + task.physics_features(data.sensordata, jnp)), None
 
         # Like the C engine, every environment step starts from a zero warm start, so its state is qpos and qvel.
-        data = self.data.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control)
+        data = self.data.replace(qpos=state.qpos, qvel=state.qvel, ctrl=control[0])
         if task.force and task.disturbed:
             data = data.replace(qfrc_applied=task.force(state.task, jnp))
         total = jnp.zeros_like(task.physics_features(data.sensordata, jnp))
-        (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), None, length=task.steps_per_env_step)
+        (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), control)
         return Reading(data.qpos, data.qvel, data.sensordata, total / task.steps_per_env_step), _overflow(data)
 
     def _keep(self, data: mjx.Data) -> mjx.Data:
@@ -183,18 +199,19 @@ def make_engine(
         raise ConfigError(f"mjx.impl: got {impl!r}; expected 'jax' or 'warp'")
     if impl == "warp":
         _start_warp(warp_on_cpu)
+    plain, curve = motors.without_curve(task.model) if impl == "jax" else (task.model, None)
     try:
-        model = mjx.put_model(task.model, impl=impl)
+        model = mjx.put_model(plain, impl=impl)
     except NotImplementedError as error:
         raise ConfigError(
             f"mjx.impl: {impl} cannot run the model of task {task.name} ({error}); set backend to cpu_pool"
         ) from None
     loops = find_loops(task.model)
     if impl == "jax":
-        return MjxEngine(task, max_episode_steps, model, mjx.make_data(model, impl=impl), loops)
+        return MjxEngine(task, max_episode_steps, model, mjx.make_data(model, impl=impl), loops, curve)
     model = model.tree_replace({"opt._impl.warn_overflow": 0})  # counted here, not printed
     data = mjx.make_data(task.model, impl=impl, naconmax=num_envs * contacts_per_env, njmax=constraints_per_env)
-    return MjxEngine(task, max_episode_steps, model, data, loops)
+    return MjxEngine(task, max_episode_steps, model, data, loops, curve)
 
 
 def _start_warp(on_cpu: bool) -> None:

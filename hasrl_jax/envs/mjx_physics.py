@@ -1,8 +1,8 @@
 """One physics step of MJX that agrees with C MuJoCo.
 
-The JAX implementation of MJX leaves out two things that C MuJoCo and MuJoCo Warp compute, and both change how Cassie
-moves: the velocity-dependent part of a closed loop's reference acceleration, and that an actuator at its force limit
-damps nothing. Both are added here from the outside.
+The JAX implementation of MJX leaves out three things that C MuJoCo and MuJoCo Warp compute, and all change how Cassie
+moves: the velocity-dependent part of a closed loop's reference acceleration, that an actuator at its force limit
+damps nothing, and DC motors. They are added here from the outside.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from hasrl_jax.envs import motors
 from hasrl_jax.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that the optional Warp is missing
@@ -38,32 +39,45 @@ def find_loops(model: mujoco.MjModel) -> Loops:
     return Loops(body, model.eq_data[connects, :6].reshape(-1, 2, 3), model.body_rootid[body], moved_by[body])
 
 
-def physics_step(model: mjx.Model, data: mjx.Data, loops: Loops) -> mjx.Data:
+def physics_step(model: mjx.Model, data: mjx.Data, loops: Loops, curve: motors.Curve | None) -> mjx.Data:
     """Advances one environment by one physics step.
 
     Args:
       model: one environment's robot.
       data: its qpos, qvel, ctrl and qacc_warmstart; anything else is overwritten.
       loops: from `find_loops`.
+      curve: of the motors, where the model's actuators are the PD loops of `motors.without_curve`.
     """
     if model.impl == mjx.Impl.WARP:
         return mjx.step(model, data)
-    data = _forward(model, data, loops) if len(loops.body) else mjx.forward(model, data)
+    data = _forward(model, data, loops, curve) if len(loops.body) or curve else mjx.forward(model, data)
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return mjx.euler(model, data)
     return mjx.implicit(_without_saturated_damping(model, data), data)
 
 
-def _forward(model: mjx.Model, data: mjx.Data, loops: Loops) -> mjx.Data:
-    """`mjx.forward`, in whose order of stages the loops' part fits between the velocities and the solver."""
+def _forward(model: mjx.Model, data: mjx.Data, loops: Loops, curve: motors.Curve | None) -> mjx.Data:
+    """`mjx.forward`, in whose order of stages the missing parts fit between the velocities and the solver."""
     data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
     data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
-    bias = loop_accelerations(data, loops).reshape(-1)
-    # The rows of `connect` constraints come first.
-    reference = data._impl.efc_aref.at[: len(bias)].add(-bias)
-    data = data.tree_replace({"_impl.efc_aref": reference})
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    if len(loops.body):
+        bias = loop_accelerations(data, loops).reshape(-1)
+        # The rows of `connect` constraints come first.
+        reference = data._impl.efc_aref.at[: len(bias)].add(-bias)
+        data = data.tree_replace({"_impl.efc_aref": reference})
+    data = mjx.fwd_actuation(model, data)
+    if curve:
+        data = _along_curve(model, data, curve)
+    data = mjx.fwd_acceleration(model, data)
     return mjx.sensor_acc(model, mjx.solve(model, data))
+
+
+def _along_curve(model: mjx.Model, data: mjx.Data, curve: motors.Curve) -> mjx.Data:
+    """`data` with the torques that motors of this curve give."""
+    speed = data._impl.actuator_velocity
+    force = motors.limited(curve, data.actuator_force, speed, model.actuator_forcerange[:, 1], jnp)
+    joint_force = data.qfrc_actuator + data._impl.actuator_moment.T @ (force - data.actuator_force)
+    return data.replace(actuator_force=force, qfrc_actuator=joint_force)
 
 
 def loop_accelerations(data: mjx.Data, loops: Loops) -> Array:

@@ -87,6 +87,8 @@ class Task:
     # (state, observation, command [..., C], xp) -> (state, observation): told from now to the end of the episode
     with_command: Callable[[Any, Array, Array, Any], tuple[Any, Array]] | None = None
     # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
+    # (state, xp) -> the action [..., A] that still acts at the beginning of an environment step, and for how long, s
+    delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
     with_push: Callable[[Any, Array, Any], Any] | None = None
     push_s: float = 0.0
 

@@ -316,7 +316,7 @@ def test_the_clock_advances_by_one_environment_step() -> None:
 @pytest.mark.parametrize("command", [{}, HEADING])
 def test_numpy_equals_jax(command: dict) -> None:
     task, envs, state, action = _moving_state(command=command)
-    _, reading, _ = envs._simulate(state, task.control(state.task, action, np))
+    _, reading, _ = envs._simulate(state, envs._control(state, action))
     rng = np.random.default_rng(5)
     reset_uniforms, uniforms = rng.random((1, task.reset_uniforms)), rng.random((1, task.step_uniforms))
     ours = task.reset(reset_uniforms, np), task.step(state.task, action, reading, uniforms, np)

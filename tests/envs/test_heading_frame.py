@@ -95,7 +95,7 @@ def _turned_world(constants: cassie.Constants, reading: Reading, angle: float) -
 def test_where_the_robot_faces_changes_neither_observation_nor_reward(angle: float) -> None:
     task, envs, state, action = _walking(12, 3, _config())
     constants = task.step.args[0]
-    _, reading, _ = envs._simulate(state, task.control(state.task, action, np))
+    _, reading, _ = envs._simulate(state, envs._control(state, action))
     reading = reading._replace(averages=task.physics_features(reading.sensordata, np))
     uniforms = np.random.default_rng(0).random((2, task.step_uniforms))
     ours = task.step(state.task, action, reading, uniforms, np)
@@ -143,12 +143,12 @@ def test_the_heading_frame_is_the_world_where_the_robot_faces_x() -> None:
     for _ in range(5):
         state, _ = envs.step(state, rng.uniform(-0.3, 0.3, (2, 10)), rng)
     action = rng.uniform(-0.3, 0.3, (2, 10))
-    _, reading, _ = envs._simulate(state, world.control(state.task, action, np))
+    _, reading, _ = envs._simulate(state, envs._control(state, action))
     command = np.array([[1.0, 0.2, 0.0, 0.9]] * 2)
     theirs = state.task._replace(command=command)
     at_once = [task.physics_features(reading.sensordata, np) for task in (world, heading)]
     results = [
-        task.step(before, action, reading._replace(averages=features), np.zeros((2, 10)), np)
+        task.step(before, action, reading._replace(averages=features), np.zeros((2, task.step_uniforms)), np)
         for task, before, features in zip((world, heading), (state.task, theirs), at_once, strict=True)
     ]
     np.testing.assert_allclose(results[1].observation[:, :50], results[0].observation, atol=1e-12)

@@ -79,6 +79,11 @@ class RewardConfig:
 
 
 @dataclass(frozen=True)
+class MotorConfig:
+    torque_speed_curve: bool = False  # fast motors give less torque, see `envs/motors.py` (the paper: no)
+
+
+@dataclass(frozen=True)
 class RandomizeConfig:
     enabled: bool = True  # draw the model anew at each reset
     share: Share = 1.0  # share of episodes with a drawn model; the others have the nominal robot
@@ -90,6 +95,18 @@ class RandomizeConfig:
     encoder_offset_rad: Share = 0.01  # half width of the encoder offset, per joint, constant in an episode, rad
     # factor on the physics step, hence the policy period
     physics_rate_scale: Annotated[Range, Limits(0.05, 10)] = (0.6, 1.2)
+    # Beyond the paper; as they stand here they change nothing.
+    pd_gain_scale: Annotated[Range, Limits(0, 10)] = (1.0, 1.0)  # factor on both PD gains, per motor
+    torque_scale: Annotated[Range, Limits(0.01, 10)] = (1.0, 1.0)  # factor on the torque limit, per motor
+    spring_scale: Annotated[Range, Limits(0.01, 10)] = (1.0, 1.0)  # factor on the stiffness, per leaf spring
+    payload_kg: Annotated[Range, Limits(-10, 100)] = (0.0, 0.0)  # mass that the pelvis carries, kg
+    center_of_mass_m: Share = 0.0  # half width of the shift of the pelvis' center of mass along each axis, m
+    # time until new targets reach the motors, one draw per episode, s; a policy period at most
+    control_delay_s: Annotated[Range, Limits(0, 1)] = (0.0, 0.0)
+    # half width of the error of the observed forward and lateral velocity, constant in an episode, m/s
+    velocity_bias_m_s: Annotated[float, Limits(0, 10)] = 0.0
+    # factor on the noise of each observation, which is drawn anew at every environment step
+    observation_noise: Annotated[float, Limits(0, 100)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,6 +141,7 @@ class CassieConfig:
     command: CommandConfig = field(default_factory=CommandConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
+    motor: MotorConfig = field(default_factory=MotorConfig)
     randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
     push: PushConfig = field(default_factory=PushConfig)
     terrain: TerrainConfig = field(default_factory=TerrainConfig)

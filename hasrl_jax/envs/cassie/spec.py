@@ -25,6 +25,13 @@ def check(config: Config) -> None:
         settings.clock.cycle_per_speed_s,
         f"a gait cycle above 0.1 s at {fastest:g} m/s",
     )
+    longest = config.physics.env_step_s
+    require(
+        settings.randomize.control_delay_s[1] <= longest,
+        "cassie.randomize.control_delay_s",
+        settings.randomize.control_delay_s,
+        f"at most a policy period, {longest:g} s",
+    )
     if settings.randomize.enabled:
         scale, timestep_s = settings.randomize.physics_rate_scale, config.physics.timestep_s
         low, high = limits_of(PhysicsConfig, "timestep_s")

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs import frames, layout
+from hasrl_jax.envs import frames, layout, motors
 from hasrl_jax.envs.cassie import clock, commands, randomize, rewards, terrain
-from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids
-from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
+from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
 from hasrl_jax.envs.draws import between
 from hasrl_jax.envs.layout import AXIAL, NEGATED, QUATERNION, SAME, VECTOR, Entry
 from hasrl_jax.envs.model import load_model
@@ -27,19 +27,27 @@ _MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name i
 _PASSIVE_SIGNS = SAME * (2 * len(PASSIVE_JOINTS))
 # What the policy sees, followed by the commands. Source: order of the published implementation, paper section II.A.
 OBSERVATION = (
-    Entry("pelvis_height", "m", SAME),  # above the ground
-    Entry("pelvis_orientation", "", QUATERNION),  # w, x, y, z; in the heading frame relative to the heading to keep
-    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True),
-    Entry("pelvis_velocity", "m/s", VECTOR),  # along the axes of the world, or along the heading to keep
-    Entry("pelvis_angular_velocity", "rad/s", AXIAL),  # pelvis frame
-    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True),
-    Entry("pelvis_acceleration", "m/s^2", VECTOR),  # pelvis frame, gravity removed
-    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True),
-    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True),
+    Entry("pelvis_height", "m", SAME, noise=0.02),  # above the ground
+    Entry(
+        "pelvis_orientation", "", QUATERNION, noise=0.01
+    ),  # w, x, y, z; in the heading frame relative to the heading to keep
+    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, noise=0.01),
+    Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1),  # along the axes of the world, or along the heading to keep
+    Entry("pelvis_angular_velocity", "rad/s", AXIAL, noise=0.2),  # pelvis frame
+    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, noise=0.5),
+    Entry("pelvis_acceleration", "m/s^2", VECTOR, noise=1.0),  # pelvis frame, gravity removed
+    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True, noise=0.01),
+    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True, noise=0.5),
     Entry("clock", "", 2 * NEGATED),  # sin and cos of the phase: half a cycle swaps the feet's clocks
 )
 ACTION = (Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True),)  # relative to NEUTRAL_RAD
 ACTION_SIZE = layout.size(ACTION)
+# No-load speed of each motor over the ratio of its gear: the joint's speed at which it gives no torque, rad/s.
+# Source: `user` and `gear` of the actuators in Oregon State University's cassie.xml (revolutions per minute).
+NO_LOAD_SPEED_RAD_S = {
+    name: rpm * 2 * np.pi / 60 / ratio
+    for name, rpm, ratio in zip(MOTORS, (2900, 2900, 1300, 1300, 5500), (25, 25, 16, 16, 50), strict=True)
+}
 NUM_ENCODERS = len(_MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # PD targets at zero action: the motor positions of the initial pose, rad. Source: published implementation,
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
@@ -76,6 +84,9 @@ class CassieState(NamedTuple):
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
     env_step_s: Array  # [...] duration of an environment step in this episode, s
+    delay_s: Array  # [...] time until new targets reach the motors, s
+    velocity_bias: Array  # [..., 2] error of the observed forward and lateral velocity, m/s
+    noise: Array  # [...] factor on the noise of the observations
 
 
 class Constants(NamedTuple):
@@ -94,6 +105,9 @@ def make(config: Config) -> Task:
     """The task with its model compiled and its names resolved."""
     ground = None if config.settings.terrain.kind == "flat" else partial(terrain.build, config.settings.terrain)
     model = load_model(ASSET, config.physics, ground)
+    if config.settings.motor.torque_speed_curve:
+        speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
+        model = motors.with_curve(model, speeds)
     nominal = randomize.nominal(model)
     constants = Constants(
         config=config.settings,
@@ -107,6 +121,8 @@ def make(config: Config) -> Task:
     drawn = commands.num_uniforms(config.settings.command) + commands.PUSH_UNIFORMS
     in_heading = config.settings.command.frame == "heading"
     drawn_at_reset = drawn + 2 + in_heading + NUM_ENCODERS + terrain.num_uniforms(config.settings.terrain)
+    drawn_at_reset += randomize.num_uniforms_beyond(config.settings.randomize)
+    noisy = noise_size(config.settings)
     return Task(
         name="cassie",
         asset=ASSET,
@@ -115,13 +131,14 @@ def make(config: Config) -> Task:
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=observation_entries(config.settings),
         action=ACTION,
-        reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset,
-        step_uniforms=drawn,
+        reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset + noisy,
+        step_uniforms=drawn + noisy,
         reward_terms=rewards.TERMS,
         measures=MEASURES + (HEADING_MEASURES if in_heading else ()),
         mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
         control=control,
+        delay=delay if max(config.settings.randomize.control_delay_s) > 0 else None,
         force=partial(force, constants),
         disturbed=config.settings.push.force_n[1] > 0,
         commands=commands.declared(config.settings.command, config.settings.reward.height_m),
@@ -138,19 +155,28 @@ def observation_entries(config: CassieConfig) -> tuple[Entry, ...]:
     return (*OBSERVATION, *(command.entry for command in commands.COMMANDS[config.command.frame]))
 
 
+def noise_size(config: CassieConfig) -> int:
+    """Uniform numbers that the noise of one observation consumes."""
+    noisy = config.randomize.enabled and config.randomize.observation_noise > 0
+    return layout.size(observation_entries(config)) if noisy else 0
+
+
 def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     """A fresh episode in the initial pose, from uniform numbers [..., reset_uniforms]."""
     config, nominal = constants.config, constants.nominal
     batch = uniforms.shape[:-1]
     in_heading = config.command.frame == "heading"
     drawn = commands.num_uniforms(config.command), commands.PUSH_UNIFORMS
-    sizes = randomize.num_uniforms(nominal), *drawn, 1, 1, int(in_heading), NUM_ENCODERS
+    sizes = [randomize.num_uniforms(nominal), *drawn, 1, 1, int(in_heading), NUM_ENCODERS]
+    sizes += [terrain.num_uniforms(config.terrain), randomize.num_uniforms_beyond(config.randomize)]
     parts = xp.split(uniforms, np.cumsum(sizes), axis=-1)
-    model_u, command_u, push_u, phase_u, start_u, heading_u, encoder_u, terrain_u = parts
+    model_u, command_u, push_u, phase_u, start_u, heading_u, encoder_u, terrain_u, more_u, noise_u = parts
 
-    fields = randomize.model_fields(model_u, nominal, config.randomize, xp)
+    fields = randomize.model_fields(model_u, more_u, nominal, config.randomize, xp)
+    is_drawn = randomize.is_drawn(model_u, config.randomize)
+    hidden = hidden_draws(more_u, is_drawn, config.randomize, xp)
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
-    offset = xp.where(randomize.is_drawn(model_u, config.randomize), config.randomize.encoder_offset_rad, 0.0)
+    offset = xp.where(is_drawn, config.randomize.encoder_offset_rad, 0.0)
     command, command_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.draw_push(push_u, config.push, xp)
     half = config.command.start_heading_rad
@@ -178,11 +204,30 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
+        **hidden,
     )
     # Nothing accelerates yet, so the first observation needs no physics.
-    observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), xp)
+    observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), noise_u, xp)
     fields |= terrain.model_fields(terrain_u, constants.model, config.terrain, xp)
     return Reset(state, observation, qpos, qvel, fields)
+
+
+def hidden_draws(uniforms: Array, is_drawn: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
+    """What an episode draws of delays and measurements: fields of `CassieState`."""
+    batch = is_drawn.shape
+    if not uniforms.shape[-1]:
+        return {"delay_s": xp.zeros(batch), "velocity_bias": xp.zeros((*batch, 2)), "noise": xp.zeros(batch)}
+    draws = randomize.beyond(uniforms, config, xp)
+    return {
+        "delay_s": xp.where(is_drawn, draws["control_delay_s"][..., 0], 0.0),
+        "velocity_bias": xp.where(is_drawn[..., None], draws["velocity_bias_m_s"], 0.0),
+        "noise": xp.where(is_drawn, config.observation_noise, 0.0),
+    }
+
+
+def delay(state: CassieState, xp: Any) -> tuple[Array, Array]:
+    """The action of the environment step before, [..., 10], and how long it still acts, s."""
+    return state.action, state.delay_s
 
 
 def control(state: CassieState, action: Array, xp: Any) -> Array:
@@ -243,7 +288,8 @@ def step(
         measured.append(xp.stack([yaw_rate, told["yaw_rate"], told["height"], error], axis=-1))
     measures = xp.concatenate(measured, axis=-1)
 
-    command_u, push_u = xp.split(uniforms, [commands.num_uniforms(config.command)], axis=-1)
+    drawn_sizes = commands.num_uniforms(config.command), commands.PUSH_UNIFORMS
+    command_u, push_u, noise_u = xp.split(uniforms, np.cumsum(drawn_sizes), axis=-1)
     drawn, drawn_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.next_push(state.push, state.push_s, state.env_step_s, push_u, config.push, xp)
     due = state.command_s <= state.env_step_s
@@ -261,18 +307,22 @@ def step(
         action=action,
         torque=torque,
     )
-    observation = observe(constants, state, reading.qpos, reading.qvel, acceleration, xp)
+    observation = observe(constants, state, reading.qpos, reading.qvel, acceleration, noise_u, xp)
     return Transition(state, observation, terms.sum(axis=-1), terminated, terms, measures)
 
 
-def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, xp: Any) -> Array:
-    """The inputs of the policy, [..., O], as `observation_entries` lists them."""
+def observe(
+    constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, noise_u: Array, xp: Any
+) -> Array:
+    """The inputs of the policy, [..., O], as `observation_entries` lists them; `noise_u`: [..., noise_size]."""
     ids, offset = constants.ids, state.encoder_offset
+    velocity = pelvis_velocity(constants, state, qvel, xp)
+    biased = velocity[..., :2] + state.velocity_bias
     values = {
         "pelvis_height": height_above_ground(constants, state, qpos, xp)[..., None],
         "pelvis_orientation": pelvis_orientation(constants, state, qpos, xp),
         "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
-        "pelvis_velocity": pelvis_velocity(constants, state, qvel, xp),
+        "pelvis_velocity": xp.concatenate([biased, velocity[..., 2:]], axis=-1),
         "pelvis_angular_velocity": qvel[..., 3:6],
         "motor_velocities": qvel[..., ids.motor_qvel],
         "pelvis_acceleration": acceleration,
@@ -280,7 +330,11 @@ def observe(constants: Constants, state: CassieState, qpos: Array, qvel: Array, 
         "passive_velocities": qvel[..., ids.passive_qvel],
         "clock": clock_signal(state, xp),
     }
-    return xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
+    observation = xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
+    if not noise_u.shape[-1]:
+        return observation
+    width = layout.noise(observation_entries(constants.config))
+    return observation + state.noise[..., None] * width * (2 * noise_u - 1)
 
 
 def with_command(
