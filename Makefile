@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install lint type test bench lock
+.PHONY: install lint type test bench docs lock
 
 install:  ## virtual environment with everything that development needs
 	$(PYTHON) -m venv .venv
@@ -21,6 +21,10 @@ bench:  ## timed figures on an idle machine, and the tables of docs/ from them
 	for name in collector scaling learner mjx parity; do \
 		$(BIN)/python -m hasrl_jax.bench $$name --json benchmarks/results/$$name.json || exit 1; done
 	$(BIN)/python -m hasrl_jax.bench docs
+
+docs:  ## the documentation site in site/; a warning or a dead link is an error
+	$(BIN)/pip install -q -c requirements.lock -e ".[docs]"
+	$(BIN)/mkdocs build --strict --quiet
 
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv

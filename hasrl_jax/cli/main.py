@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 # name -> (module with `main(arguments) -> exit status`, one line of help); modules load only when they are run
 PROGRAMS = {
+    "demo": ("hasrl_jax.cli.demo", "watch a released policy walk, at once"),
     "train": ("hasrl_jax.cli.train", "train a policy, or continue a run"),
     "evaluate": ("hasrl_jax.cli.evaluate", "play a policy and measure it; a whole scorecard with --scorecard"),
     "render": ("hasrl_jax.cli.render", "film a policy"),

@@ -15,8 +15,12 @@ from hasrl_jax.visualize.viewer import browser, native
 from hasrl_jax.visualize.viewer.live import Live, Pace
 
 
-def view(arguments: list[str]) -> None:
+def view(arguments: list[str], opened: Callable[[str], object] | None = None) -> None:
     """The command: loads a policy and shows it until it is interrupted.
+
+    Args:
+      arguments: the command line.
+      opened: called with the address of the page.
 
     Raises:
       ConfigError: an impossible argument, or nothing to show it with; RunError, CheckpointError: no policy.
@@ -38,6 +42,8 @@ def view(arguments: list[str]) -> None:
     page = browser.Browser(live, known.port, known.randomized)
     try:
         print(f"open {page.url} (this machine only); Ctrl-C ends the viewer", flush=True)
+        if opened:
+            opened(page.url)
         loop(live, page, Pace(), lambda: False)
     except KeyboardInterrupt:
         print("ended")
@@ -67,7 +73,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     return parser.parse_known_args(arguments)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit status."""
+def main(argv: list[str] | None = None, opened: Callable[[str], object] | None = None) -> int:
+    """Entry point; returns the exit status. `opened` is called with the address of the page."""
     log_to_terminal()
-    return run(lambda: view(sys.argv[1:] if argv is None else argv))
+    return run(lambda: view(sys.argv[1:] if argv is None else argv, opened))

@@ -53,7 +53,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
       config: default `configs/cassie_walk.yaml`; reads `task`, `physics`, the task's settings and
         `collect.max_episode_steps`.
       render_mode: None or "rgb_array".
-      width, height: of rendered frames, pixels.
+      width: of rendered frames, pixels.
+      height: of rendered frames, pixels.
       camera: name of a camera of the model.
       shadow_px: side of the shadow map; None keeps the model's.
 

@@ -33,7 +33,8 @@ def describe(
     """Gait figures of every episode, each [N]; NaN where an episode has too few steps for it.
 
     Args:
-      left_force, right_force: vertical ground force of each foot, N.
+      left_force: vertical ground force of the left foot, N.
+      right_force: of the right one, N.
       power: sum over the motors of |torque x velocity|, W.
       speed: forward, m/s.
       mass_kg: of the robot.

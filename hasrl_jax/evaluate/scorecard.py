@@ -128,7 +128,9 @@ def write(
     Args:
       directory: made if missing.
       policies: by name: configuration, with the physics to play under, and parameters; all of the walking task.
-      episodes, seconds, seed: as in `measure`.
+      episodes: as in `measure`.
+      seconds: as in `measure`.
+      seed: as in `measure`.
       command: what to type for the same numbers, for the page.
 
     Raises:

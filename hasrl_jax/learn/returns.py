@@ -29,7 +29,12 @@ def advantage_and_target(
     A masked step gets 0 and lends nothing to the step before it, neither its advantage nor its value.
 
     Args:
-      reward, value, terminated, truncated, bootstrap_value, mask: [B, T], as in `Trajectory`.
+      reward: [B, T], as in `Trajectory`, like the next five.
+      value: [B, T].
+      terminated: [B, T] bool.
+      truncated: [B, T] bool.
+      bootstrap_value: [B, T].
+      mask: [B, T] bool.
       discount: gamma.
       gae_lambda: lambda; ignored by "return".
       setting: "gae" or "return".
