@@ -131,20 +131,7 @@ def task_tables() -> str:
         "float32. *Mirror* is the sign of each number in the left-right mirror image; the numbers of legs also change "
         "places. Actions are clipped to [-1, 1].",
     ]
-    for name in BUILT_IN:
-        task = make_task(recipe(name))
-        source = inspect.getmodule(task.step.func if isinstance(task.step, functools.partial) else task.step)
-        parts += [
-            f"## {name}",
-            _layout_table("Observation", task.observation, source),
-            _layout_table("Action", task.action, source),
-        ]
-        if task.commands:
-            parts += [
-                f"### Commands of {name}",
-                _commands(task),
-                f"A push of the viewer, of a film or of `TaskEnv.push` lasts {task.push_s:g} s.",
-            ]
+    parts += _task_parts("cassie")
     heading = make_task(from_dict({"cassie": {"command": {"frame": "heading"}}}, recipe("cassie")))
     targets = ", ".join(f"{value:.4f}" for value in cassie.NEUTRAL_RAD)
     parts += [
@@ -177,7 +164,24 @@ def task_tables() -> str:
             [[f"`{name}`", _comment(cassie, f'"{name}"')] for name in (*cassie.MEASURES, *cassie.HEADING_MEASURES)],
         ),
     ]
+    parts += [part for name in BUILT_IN if name != "cassie" for part in _task_parts(name)]
     return "\n\n".join(parts) + "\n"
+
+
+def _task_parts(name: str) -> list[str]:
+    """What is said of every task."""
+    task = make_task(recipe(name))
+    source = inspect.getmodule(task.step.func if isinstance(task.step, functools.partial) else task.step)
+    parts = [
+        f"## {name}",
+        _layout_table("Observation", task.observation, source),
+        _layout_table("Action", task.action, source),
+    ]
+    if task.commands:
+        parts += [f"### Commands of {name}", _commands(task)]
+    if task.with_push:
+        parts.append(f"A push of the viewer, of a film or of `TaskEnv.push` lasts {task.push_s:g} s.")
+    return parts
 
 
 def _layout_table(title: str, entries: tuple[Entry, ...], source: ModuleType | None) -> str:

@@ -6,6 +6,7 @@ One line per check; exit status 1 when one of them fails.
 import importlib.metadata
 import os
 import platform
+import shutil
 import sys
 import tempfile
 import time
@@ -21,6 +22,8 @@ OLDEST_PYTHON = (3, 11)
 LOW_MEMORY_GIB = 2.0  # less is enough for a small run only
 SLOW_START_S = 5.0
 LARGE_WORKER_MIB = 400.0
+NVIDIA_DRIVER = Path("/proc/driver/nvidia/version")
+NO_CUDA = '; there is an NVIDIA GPU that JAX does not use: pip install "hasrl_jax[cuda]", or in a checkout ".[cuda]"'
 
 
 class Check(NamedTuple):
@@ -55,11 +58,18 @@ def check_packages() -> Iterator[Check]:
 
 
 def check_devices() -> Iterator[Check]:
-    """What JAX computes on."""
+    """What JAX computes on, and whether it overlooks a GPU."""
     import jax
 
     devices = jax.devices()
-    yield Check("devices", "ok", ", ".join(f"{device.platform}:{device.id} {device.device_kind}" for device in devices))
+    names = ", ".join(f"{device.platform}:{device.id} {device.device_kind}" for device in devices)
+    overlooked = all(device.platform == "cpu" for device in devices) and has_nvidia_gpu()
+    yield Check("devices", "warn" if overlooked else "ok", names + NO_CUDA * overlooked)
+
+
+def has_nvidia_gpu() -> bool:
+    """Whether the driver of an NVIDIA GPU is there."""
+    return NVIDIA_DRIVER.exists() or shutil.which("nvidia-smi") is not None
 
 
 def check_cores_and_memory() -> Iterator[Check]:

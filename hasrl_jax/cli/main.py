@@ -22,6 +22,12 @@ PROGRAMS = {
 }
 
 
+WINDOWS = (
+    "error: hasrl_jax runs on Linux and macOS; on Windows install it inside WSL 2 (in PowerShell: wsl --install), "
+    "where its workers can inherit file descriptors; docs/troubleshooting.md says more"
+)
+
+
 def start(program: str, arguments: list[str] | None = None) -> int:
     """Runs a program; returns its exit status. Until it is loaded, Ctrl-C ends it on one line.
 
@@ -29,6 +35,9 @@ def start(program: str, arguments: list[str] | None = None) -> int:
       program: one of PROGRAMS.
       arguments: default: those of this process.
     """
+    if sys.platform == "win32":
+        print(WINDOWS, file=sys.stderr)
+        return 1
     for descriptor in (0, 1, 2):  # one that is closed would soon be a file of ours, and what is printed would go there
         try:
             os.fstat(descriptor)
