@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install lint type test bench docs lock
+.PHONY: install lint type test bench docs wheel lock
 
 install:  ## virtual environment with everything that development needs
 	$(PYTHON) -m venv .venv
@@ -26,6 +26,18 @@ docs:  ## the documentation site in site/; a warning or a dead link is an error
 	$(BIN)/pip install -q -c requirements.lock -e ".[docs]"
 	$(BIN)/mkdocs build --strict --quiet
 
+wheel:  ## wheel and sdist in dist/, checked, installed in an empty environment elsewhere, and used
+	$(BIN)/pip install -q -c requirements.lock -e ".[release]"
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python tools/try_wheel.py dist
+
+COMPILE := uv pip compile --universal --python-version 3.11 --no-header --no-annotate pyproject.toml
+EXTRAS := $(foreach name,cuda dev docs ray release viewer,--extra $(name))
+
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv
-	$(BIN)/uv pip compile --universal --python-version 3.11 --extra cuda --extra dev --extra docs --extra ray --extra release --extra viewer --no-header --no-annotate pyproject.toml -o requirements.lock
+	$(BIN)/$(COMPILE) $(EXTRAS) -o requirements.lock
+	$(BIN)/$(COMPILE) -c requirements.lock --generate-hashes --extra viewer -o docker/requirements-cpu.lock
+	$(BIN)/$(COMPILE) -c requirements.lock --generate-hashes --extra viewer --extra cuda -o docker/requirements-cuda.lock

@@ -2,6 +2,6 @@
 
 from hasrl_jax.envs.registration import register
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 register()

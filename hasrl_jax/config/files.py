@@ -18,8 +18,8 @@ EXTENDS = "extends"  # the key that names the file whose values a file starts fr
 def _config_folder() -> Path:
     """configs/, beside the package in a checkout and inside it in a wheel."""
     package = Path(__file__).parents[1]
-    folders = package.parent / "configs", package / "configs"
-    return next((folder for folder in folders if folder.is_dir()), folders[0])
+    folders = package / "configs", package.parent / "configs"  # beside an installed one may be another project's
+    return next((folder for folder in folders if folder.is_dir()), folders[-1])
 
 
 CONFIG_FOLDER = _config_folder()
