@@ -3,6 +3,7 @@
 import sys
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -248,3 +249,38 @@ def test_bad_arguments_are_one_line(
     assert status == 2
     assert named in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(("aspect", "share"), [(0.5, 0.4), (1.6, 0.75)])
+def test_the_robot_stands_above_the_panel_of_a_narrow_window(aspect: float, share: float) -> None:
+    """Its pelvis and feet are projected by hand: 0 is the upper edge of the window, 1 the lower one."""
+    position, target = (np.array(point) for point in browser.camera(aspect))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    up = np.cross(right / np.linalg.norm(right), ahead)
+    for point in ([0.0, 0.0, 1.1], [0.0, 0.0, 0.0]):
+        seen = np.array(point) - position
+        height = 0.5 - 0.5 * (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # the page's field of view
+        assert 0.05 < height < share
+
+
+def test_a_narrow_window_gets_a_camera_of_its_own() -> None:
+    for aspect, moved in ((0.5, True), (1.6, False)):
+        client = SimpleNamespace(camera=SimpleNamespace(aspect=aspect, position=None, look_at=None))
+        browser._place_camera(client)  # type: ignore[arg-type]
+        assert ((client.camera.position, client.camera.look_at) == browser.camera(0.5)) == moved
+
+
+def test_the_arrow_of_a_push_stays_for_a_moment(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live, port=0)
+    try:
+        live.advance(Controls(reset=True, push=Push(80.0, 90.0)))
+        seen = []
+        for _ in range(60):
+            page.show(live.view(), 1.0)
+            seen.append(page._arrow.visible)
+            live.advance(Controls())
+        assert 25 <= sum(seen) <= 40 and seen[0] and not seen[-1]  # 8 environment steps, and 24 more
+    finally:
+        page.close()

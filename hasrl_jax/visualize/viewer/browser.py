@@ -25,6 +25,8 @@ FLOOR_M = -0.01  # height of the model's floor
 TILE_M = 1.0
 SHOWN_GROUND_M = 5.0  # half size of the boxes of the ground, at most; they are endless to the robot
 READOUT_EVERY = 8  # environment steps
+ARROW_STEPS = 24  # environment steps that the arrow of a push stays, which is over before one has seen it
+NARROW = 0.8  # width over height of a window below which the panel covers its lower half, as on a phone
 MISSING = 'the viewer in the browser needs the package viser: pip install "hasrl_jax[viewer]"; or use --native'
 
 
@@ -49,7 +51,7 @@ class Browser:
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self._lock = threading.Lock()  # viser calls back on threads of its own
         self._reset, self._push = False, False
-        self._shown, self._episode = 0, 0
+        self._shown, self._episode, self._arrow_steps = 0, 0, 0
         self._origin = np.zeros(3)
         self._model, self._commands = live.model, live.commands
         self._build_panel(live, randomized)
@@ -138,8 +140,8 @@ class Browser:
     def _build_scene(self, model: mujoco.MjModel) -> None:
         server, scene = self._server, self._server.scene
         scene.set_up_direction("+z")
-        server.initial_camera.position = (2.2, -2.2, 1.3)
-        server.initial_camera.look_at = (0.0, 0.0, 0.65)
+        server.initial_camera.position, server.initial_camera.look_at = camera(1.0)
+        server.on_client_connect(_place_camera)
         self._world = scene.add_frame("/world", show_axes=False)
         self._floor = scene.add_grid(
             "/world/floor", 40.0, 40.0, cell_size=TILE_M / 2, section_size=TILE_M, plane_opacity=0.4, fade_distance=25.0
@@ -178,11 +180,25 @@ class Browser:
             )
 
     def _show_push(self, view: View, pelvis: np.ndarray) -> None:
-        self._arrow.visible = view.push is not None
+        self._arrow_steps = ARROW_STEPS if view.push else max(0, self._arrow_steps - 1)
+        self._arrow.visible = self._arrow_steps > 0
         if view.push:
             half = math.radians(view.push.direction_deg) / 2
             self._arrow.position = pelvis
             self._arrow.wxyz = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+def camera(aspect: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Where a visitor's camera stands and what it looks at, m, by the width over height of the window.
+
+    In a narrow one it looks at the ground before the robot, which then stands in the upper part, above the panel.
+    """
+    return ((2.8, -2.8, 1.6), (1.46, -1.46, 0.03)) if aspect < NARROW else ((2.2, -2.2, 1.3), (0.0, 0.0, 0.65))
+
+
+def _place_camera(client: "viser.ClientHandle") -> None:
+    if client.camera.aspect < NARROW:
+        client.camera.position, client.camera.look_at = camera(client.camera.aspect)
 
 
 def require_viser() -> None:
