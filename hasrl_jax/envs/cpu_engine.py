@@ -148,6 +148,30 @@ class CpuEnvs:
         late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
         return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
 
+    def keep(self, before: EnvState, after: EnvState, envs: np.ndarray, fields: bool = True) -> EnvState:
+        """`after` with the environments numbered `envs` as they were `before`.
+
+        `fields`: their models, too; without it the state is only for looking at, or no episode ended in between.
+        """
+
+        def put(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+            new = new.copy()
+            new[envs] = old[envs]
+            return new
+
+        if fields:
+            for env in envs:
+                self._write_fields(env, before.model_fields, env)
+        return EnvState(
+            physics=put(after.physics, before.physics),
+            task=type(after.task)(*map(put, after.task, before.task)),
+            model_fields={name: put(values, before.model_fields[name]) for name, values in after.model_fields.items()},
+            observation=put(after.observation, before.observation),
+            is_first=put(after.is_first, before.is_first),
+            episode_step=put(after.episode_step, before.episode_step),
+            episode_return=put(after.episode_return, before.episode_return),
+        )
+
     def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[np.ndarray, Reading, np.ndarray]:
         """Runs the physics steps of one environment step under `control`, [E, S or 1, nu].
 
@@ -158,7 +182,7 @@ class CpuEnvs:
         self._controls[:, :, : model.nu] = control
         if self._force:
             self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
-        cpu = time.process_time()
+        cpu = time.thread_time()  # MuJoCo runs on this thread
         self._rollout.rollout(
             self._models,
             [self._data],
@@ -170,7 +194,7 @@ class CpuEnvs:
             state=self._states,
             sensordata=self._sensordata,
         )
-        self.physics_seconds += time.process_time() - cpu
+        self.physics_seconds += time.thread_time() - cpu
         end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
         timestep = state.model_fields.get("timestep", self._timestep)
@@ -181,7 +205,7 @@ class CpuEnvs:
             qpos=end[:, 1 : 1 + model.nq],
             qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
             sensordata=sensordata,
-            averages=task.physics_features(self._sensordata, np).mean(axis=1),
+            averages=task.physics_features(self._sensordata, np).sum(axis=1) / task.steps_per_env_step,
         )
         return end, reading, diverged
 
