@@ -78,6 +78,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._scene: Scene | None = None
         self._state: EnvState | None = None
         self._ended = False
+        self._pushable = False
         self._open()
         self._camera = camera_of(self.task, camera)
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.env_step_s)}
@@ -171,6 +172,10 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.task.with_push is None:
             raise ConfigError(f"push: the robot of task {self.task.name!r} cannot be pushed")
         state = self._running()
+        if not self._pushable:  # what can be pushed costs a tenth of a step even while nobody pushes
+            self._pushable = True
+            self._envs = self._engine()
+            self._envs.restore(state)
         force = np.array([[forward_n, lateral_n]], np.float64)
         self._state = state._replace(task=self.task.with_push(state.task, force, np))
 
@@ -228,9 +233,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _open(self) -> None:
         """Makes the task and the engine that runs it."""
         self.task: Task = make_task(self.config)
-        pushable = self.task.with_push is not None
-        self._envs = CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, pushable)
+        self._envs = self._engine()
         self._info_names = info_names(self.task)
+
+    def _engine(self) -> CpuEnvs:
+        return CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, self._pushable)
 
     def _running(self) -> EnvState:
         """The state of the running episode."""

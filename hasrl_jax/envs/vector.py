@@ -86,7 +86,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.task = make_task(config)
         self._camera = camera_of(self.task, camera)
         self._scene: Scene | None = None
-        self._envs = CpuEnvs(self.task, num_envs, config.collect.max_episode_steps, self.task.with_push is not None)
+        self._envs = CpuEnvs(self.task, num_envs, config.collect.max_episode_steps)
         self._state: EnvState | None = None
         self._info_names = info_names(self.task)
         fps = round(1 / self.task.env_step_s)

@@ -84,7 +84,7 @@ def test_every_environment_goes_on_as_if_it_were_alone(mode: AutoresetMode, limi
     envs = vector.make(
         "cassie", from_dict(task | {"collect": {"max_episode_steps": limit}}), num_envs=5, autoreset_mode=mode
     )
-    alone = CpuEnvs(envs.task, 1, limit, pushable=True)
+    alone = CpuEnvs(envs.task, 1, limit)
     envs.reset(seed=1)
     rng = np.random.default_rng(0)
     over = np.zeros(5, bool)

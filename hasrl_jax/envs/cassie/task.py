@@ -416,9 +416,11 @@ def reward_errors(
     told = commands.named(state.command, config.command)
     speed = told["forward"]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
-    standing = state.standing[..., None]
-    force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
-    most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, rewards.MAX_FOOT_FORCE_N)
+    most_force: Array | float = rewards.MAX_FOOT_FORCE_N
+    if config.command.frame == "heading":  # elsewhere the clock never rests
+        standing = state.standing[..., None]
+        force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
+        most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     height = height_above_ground(constants, state, reading.qpos, xp)
     orientation = pelvis_orientation(constants, state, reading.qpos, xp)
