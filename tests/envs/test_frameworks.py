@@ -30,7 +30,7 @@ def test_stable_baselines_trains_on_it(algorithm: str) -> None:
     before = [parameter.detach().clone() for parameter in model.policy.parameters()]
     model.learn(256)
     assert model.num_timesteps == 256
-    assert len(model.ep_info_buffer) > 4 and all(1 <= info["l"] == info["r"] + 1 <= 51 for info in model.ep_info_buffer)
+    assert len(model.ep_info_buffer) > 4 and all(0 <= info["l"] - info["r"] <= 1 for info in model.ep_info_buffer)
     changed = [not np.array_equal(b, a.detach()) for b, a in zip(before, model.policy.parameters(), strict=True)]
     assert any(changed)
     envs.close()
