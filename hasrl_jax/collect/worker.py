@@ -39,7 +39,7 @@ class Actor:
         self.config, self.plan, self.index = config, plan, index
         self.task: Task = make_task(config)
         self.mirror: Mirror | None = self.task.mirror if config.network.symmetric else None
-        self.envs = CpuEnvs(self.task, plan.envs_per_worker, config.collect.max_episode_steps)
+        self.envs = CpuEnvs(self.task, plan.envs_per_worker, config.collect.max_episode_steps, timed=True)
         self.state: Any = None  # EnvState once the first collection has begun
         self.carry = np.zeros((plan.envs_per_worker, *plan.carry_shape), np.float32)
         self.stream = config.distributed.process_id * plan.num_workers + index  # no other worker of the run has it

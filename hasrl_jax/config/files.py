@@ -51,7 +51,8 @@ def recipe(task: str) -> Config:
     Raises:
       ConfigError: there is no such task.
     """
-    return load_yaml(tasks.find(task).recipe, task)
+    values = tasks.find(task).recipe
+    return from_dict(values | {"task": task}) if isinstance(values, dict) else load_yaml(values, task)
 
 
 def dump_yaml(config: Config) -> str:

@@ -26,7 +26,8 @@ class TaskSpec:
 
     name: str  # of the task, and of the group of its settings in a configuration
     make: Callable[[Config], Any]  # -> envs.task.Task
-    recipe: Path  # the YAML file that trains it when no other is named
+    # What trains it when no file is named: a YAML file, or the values themselves
+    recipe: Path | dict[str, Any] = dataclasses.field(default_factory=dict)
     settings: type | None = None  # frozen dataclass of its own settings, with a default for every field
     check: Callable[[Config], None] | None = None  # raises ConfigError for settings that do not fit together
     # What a policy is played under: finer physics than that of the training; by default the same.

@@ -56,15 +56,17 @@ class CpuEnvs:
       num_envs: E.
       max_episode_steps: time limit in environment steps.
       pushable: whether `Task.with_push` may be used on a task that is not disturbed by itself.
+      timed: whether `physics_seconds` is counted.
     """
 
-    def __init__(self, task: Task, num_envs: int, max_episode_steps: int, pushable: bool = False):
+    def __init__(self, task: Task, num_envs: int, max_episode_steps: int, pushable: bool = False, timed: bool = False):
         # `step` reports a diverged simulation; MuJoCo would also write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
         self.max_episode_steps = max_episode_steps
         self.num_envs = num_envs
         self._timestep = task.model.opt.timestep
+        self._timed = timed
         self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
         self._models = [task.model] * num_envs
         self._prepared: Reset | None = None  # E fresh episodes
@@ -134,8 +136,8 @@ class CpuEnvs:
             episode_step=episode_step,
             episode_return=state.episode_return + result.reward,
         )
-        ended = np.flatnonzero(terminated | truncated | diverged)
-        return (self._reset_some(state, ended, rng) if len(ended) else state), step_result
+        ended = terminated | truncated | diverged
+        return (self._reset_some(state, np.flatnonzero(ended), rng) if ended.any() else state), step_result
 
     def _control(self, state: EnvState, action: np.ndarray) -> np.ndarray:
         """Controls of the physics steps of an environment step, [E, S, nu], or [E, 1, nu] where all are the same."""
@@ -148,6 +150,30 @@ class CpuEnvs:
         late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
         return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
 
+    def keep(self, before: EnvState, after: EnvState, envs: np.ndarray, fields: bool = True) -> EnvState:
+        """`after` with the environments numbered `envs` as they were `before`.
+
+        `fields`: their models, too; without it the state is only for looking at, or no episode ended in between.
+        """
+
+        def put(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+            new = new.copy()
+            new[envs] = old[envs]
+            return new
+
+        if fields:
+            for env in envs:
+                self._write_fields(env, before.model_fields, env)
+        return EnvState(
+            physics=put(after.physics, before.physics),
+            task=type(after.task)(*map(put, after.task, before.task)),
+            model_fields={name: put(values, before.model_fields[name]) for name, values in after.model_fields.items()},
+            observation=put(after.observation, before.observation),
+            is_first=put(after.is_first, before.is_first),
+            episode_step=put(after.episode_step, before.episode_step),
+            episode_return=put(after.episode_return, before.episode_return),
+        )
+
     def _simulate(self, state: EnvState, control: np.ndarray) -> tuple[np.ndarray, Reading, np.ndarray]:
         """Runs the physics steps of one environment step under `control`, [E, S or 1, nu].
 
@@ -158,7 +184,7 @@ class CpuEnvs:
         self._controls[:, :, : model.nu] = control
         if self._force:
             self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
-        cpu = time.process_time()
+        cpu = time.thread_time() if self._timed else 0.0  # MuJoCo runs on this thread
         self._rollout.rollout(
             self._models,
             [self._data],
@@ -170,18 +196,20 @@ class CpuEnvs:
             state=self._states,
             sensordata=self._sensordata,
         )
-        self.physics_seconds += time.process_time() - cpu
+        if self._timed:
+            self.physics_seconds += time.thread_time() - cpu
         end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
         timestep = state.model_fields.get("timestep", self._timestep)
         elapsed = end[:, 0] - state.physics[:, 0]
         on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
-        diverged = ~(on_time & np.isfinite(end).all(axis=1) & np.isfinite(sensordata).all(axis=1))
+        # A sum is finite where all its numbers are.
+        diverged = ~(on_time & np.isfinite(end.sum(axis=1) + sensordata.sum(axis=1)))
         reading = Reading(
             qpos=end[:, 1 : 1 + model.nq],
             qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
             sensordata=sensordata,
-            averages=task.physics_features(self._sensordata, np).mean(axis=1),
+            averages=task.physics_features(self._sensordata, np).sum(axis=1) / task.steps_per_env_step,
         )
         return end, reading, diverged
 

@@ -2,13 +2,14 @@
 
 from typing import Any
 
+from hasrl_jax.envs.layout import columns
 from hasrl_jax.types import Array
 
 
 def up_in_body_frame(quat: Array, xp: Any) -> Array:
     """The world's vertical in the frame that `quat` (w, x, y, z) orients, [..., 4] -> [..., 3]."""
     w, x, y, z = (quat[..., i] for i in range(4))
-    return xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    return columns([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], xp)
 
 
 def heading(quat: Array, xp: Any) -> Array:
@@ -25,7 +26,7 @@ def wrapped(angle: Array, xp: Any) -> Array:
 def turned(vector: Array, angle: Array, xp: Any) -> Array:
     """A vector whose first two numbers are horizontal, turned by `angle`: [..., n], [...] -> [..., n]."""
     cos, sin, x, y = xp.cos(angle), xp.sin(angle), vector[..., 0], vector[..., 1]
-    horizontal = xp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    horizontal = columns([cos * x - sin * y, sin * x + cos * y], xp)
     return xp.concatenate([horizontal, vector[..., 2:]], axis=-1)
 
 
@@ -33,5 +34,5 @@ def turned_quaternion(quat: Array, angle: Array, xp: Any) -> Array:
     """An orientation (w, x, y, z) turned by `angle`, with w >= 0: [..., 4], [...] -> [..., 4]."""
     cos, sin = xp.cos(angle / 2), xp.sin(angle / 2)
     w, x, y, z = (quat[..., i] for i in range(4))
-    result = xp.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], axis=-1)
+    result = columns([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], xp)
     return xp.where(result[..., :1] < 0, -result, result)

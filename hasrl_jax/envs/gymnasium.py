@@ -3,7 +3,6 @@
 It is the collectors' own `CpuEnvs` with a single environment, so what is true of one is true of the other.
 """
 
-import os
 import weakref
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -19,9 +18,9 @@ from hasrl_jax.config.files import recipe
 from hasrl_jax.config.limits import Limits, check_number
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
-from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registration import register
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.scene import Scene, camera_of, place_ground
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import ConfigError
 
@@ -55,7 +54,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
       render_mode: None or "rgb_array".
       width: of rendered frames, pixels.
       height: of rendered frames, pixels.
-      camera: name of a camera of the model.
+      camera: name of a camera of the model; default `track`, or the first one.
       shadow_px: side of the shadow map; None keeps the model's.
 
     Raises:
@@ -70,25 +69,21 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
-        camera: str = "track",
+        camera: str | None = None,
         shadow_px: int | None = None,
     ):
         self.config = recipe("cassie") if config is None else config
         check(self.config)
-        if render_mode not in (None, "rgb_array"):
-            raise ConfigError(f"render_mode: got {render_mode!r}; expected None or 'rgb_array'")
-        self.render_mode = render_mode
-        self.frame_size, self._camera, self._shadow_px = (height, width), camera, shadow_px
-        self._renderer: mujoco.Renderer | None = None
+        self.render_mode = known_render_mode(render_mode)
+        self.frame_size, self._shadow_px = (height, width), shadow_px
+        self._scene: Scene | None = None
         self._state: EnvState | None = None
         self._ended = False
+        self._pushable = False
         self._open()
-        cameras = [self.task.model.camera(index).name for index in range(self.task.model.ncam)]
-        if camera not in cameras:
-            raise ConfigError(f"camera: got {camera!r}; expected one of {', '.join(cameras)}")
+        self._camera = camera_of(self.task, camera)
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.env_step_s)}
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.task.observation_size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self.observation_space, self.action_space = spaces(self.task)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -109,7 +104,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if set(options) - {"command"}:
             raise ValueError(f"options: unknown {sorted(set(options) - {'command'})}; known is 'command'")
         told = options.get("command")
-        command = None if told is None else self.check_command(told)
+        command = None if told is None else whole_command(self.task, told)
         self._state = self._envs.reset(self.np_random)
         self._ended = False
         self._observation = self._state.observation[0].astype(np.float32)
@@ -138,9 +133,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._observation = result.final_observation[0].astype(np.float32)
         if not self._ended:  # at the end the state is already that of the next episode
             self._shown = self._state
-        names = [f"reward/{name}" for name in self.task.reward_terms] + list(self.task.measures)
-        values = np.concatenate([result.reward_terms[0], result.measures[0]]).tolist()
-        info = dict(zip(names, values, strict=True)) | {"diverged": diverged}
+        values = result.reward_terms[0].tolist() + result.measures[0].tolist()
+        info: dict[str, Any] = dict(zip(self._info_names, values, strict=True))
+        info["diverged"] = diverged
         reward = 0.0 if diverged else float(result.reward[0])
         return self._observation.copy(), reward, terminated, truncated, info
 
@@ -154,27 +149,20 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             return None
         if self._state is None:
             raise RuntimeError("nothing to render: call reset() first")
-        if self._renderer is None:
-            self._renderer = self._make_renderer()
-        renderer, data = self._renderer, self._render_data
-        data.qpos[:] = self.qpos
-        self.place_ground(renderer.model)
-        mujoco.mj_forward(renderer.model, data)
-        renderer.update_scene(data, self._camera)
-        return renderer.render()
+        if self._scene is None:
+            self._scene = Scene(self.task, self.config.physics, *self.frame_size, self._camera, self._shadow_px)
+            weakref.finalize(self, self._scene.close)  # also at exit, while OpenGL can still be called
+        return self._scene.frame(self.qpos, self._shown.model_fields)
 
     def place_ground(self, model: mujoco.MjModel) -> None:
         """Puts the ground of the running episode into `model`, another copy of the task's; level ground stays."""
-        if self.task.ground:
-            ground = model.geom_bodyid == 0  # the first geoms of any model
-            for name in ("geom_pos", "geom_size"):
-                getattr(model, name)[ground] = self._shown.model_fields[name][0, : ground.sum()]
+        place_ground(self.task, model, self._shown.model_fields)
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None
 
     def push(self, forward_n: float, lateral_n: float) -> None:
         """Pushes the robot with a force, N along the world's x and y, from now for `task.push_s` seconds.
@@ -185,6 +173,10 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.task.with_push is None:
             raise ConfigError(f"push: the robot of task {self.task.name!r} cannot be pushed")
         state = self._running()
+        if not self._pushable:  # what can be pushed costs a tenth of a step even while nobody pushes
+            self._pushable = True
+            self._envs = self._engine()
+            self._envs.restore(state)
         force = np.array([[forward_n, lateral_n]], np.float64)
         self._state = state._replace(task=self.task.with_push(state.task, force, np))
 
@@ -213,24 +205,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
           ConfigError: names the command, the value and what would work.
         """
-        commands = self.task.commands
-        if not commands:
-            raise ConfigError(f"command: task {self.task.name!r} takes no command")
-        if isinstance(told, Mapping):
-            told, named = (), {**told, **named}
-        known = ", ".join(f"{command.name} ({command.unit})" for command in commands)
-        if not isinstance(told, Sequence | np.ndarray) or len(told) > len(commands):
-            raise ConfigError(f"command: got {told!r}; expected at most {len(commands)} numbers: {known}")
-        values = dict(zip((command.name for command in commands), told, strict=False)) | named
-        unknown = sorted(values.keys() - {command.name for command in commands})
-        if unknown:
-            raise ConfigError(f"command: got {unknown[0]!r}; expected {known}")
-        whole = [values.get(command.name, command.default) for command in commands]
-        for command, value in zip(commands, whole, strict=True):
-            if not isinstance(value, Real):
-                raise ConfigError(f"command {command.name}: got {value!r}; expected a number, {command.unit}")
-            check_number(f"command {command.name}", value, Limits(*command.limits))
-        return np.array(whole, np.float64)
+        return whole_command(self.task, told, **named)
 
     @property
     def qpos(self) -> np.ndarray:
@@ -246,12 +221,12 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __getstate__(self) -> dict[str, Any]:
         # What is simulated is arrays, and is copied; the engine and the renderer are made anew.
-        left_out = ("task", "_envs", "_renderer", "_render_data")
+        left_out = ("task", "_envs", "_scene")
         return {name: value for name, value in vars(self).items() if name not in left_out}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._renderer = None
+        self._scene = None
         self._open()
         if self._state is not None:
             self._envs.restore(self._state)
@@ -259,8 +234,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _open(self) -> None:
         """Makes the task and the engine that runs it."""
         self.task: Task = make_task(self.config)
-        pushable = self.task.with_push is not None
-        self._envs = CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, pushable)
+        self._envs = self._engine()
+        self._info_names = info_names(self.task)
+
+    def _engine(self) -> CpuEnvs:
+        return CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, self._pushable)
 
     def _running(self) -> EnvState:
         """The state of the running episode."""
@@ -275,25 +253,50 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._state = self._state._replace(task=state, observation=observation)
         self._observation = observation[0].astype(np.float32)
 
-    def _make_renderer(self) -> mujoco.Renderer:
-        # A model of its own: the one that is simulated has no visual shapes and carries the randomised fields.
-        model = load_model(self.task.asset, self.config.physics, self.task.ground, visual=True)
-        height, width = self.frame_size
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        if self._shadow_px is not None:
-            model.vis.quality.shadowsize = self._shadow_px
-        # The floor acts everywhere but is drawn to its size: draw it endless, or a robot walks off it.
-        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0
-        model.mat_reflectance[:] = 0  # reflections draw the scene twice, which software rendering pays in full
-        model.vis.map.shadowclip = 3  # the edge of the shadow map speckles the floor; put it out of sight
-        self._render_data = mujoco.MjData(model)
-        try:
-            renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # each OpenGL library fails in its own way
-            backend = os.environ.get("MUJOCO_GL") or "not set"
-            raise RuntimeError(
-                f"cannot render: no OpenGL context (MUJOCO_GL is {backend}); set MUJOCO_GL to egl or osmesa before "
-                "Python starts"
-            ) from error
-        weakref.finalize(self, renderer.close)  # also at exit, while OpenGL can still be called
-        return renderer
+
+def known_render_mode(render_mode: str | None) -> str | None:
+    """`render_mode` as it is.
+
+    Raises:
+      ConfigError: there is no such mode.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode: got {render_mode!r}; expected None or 'rgb_array'")
+    return render_mode
+
+
+def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of observations and of actions, both float32."""
+    observation = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
+
+
+def info_names(task: Task) -> list[str]:
+    """What `info` holds: `reward/<name>` for each weighted term, then the measures."""
+    return [f"reward/{name}" for name in task.reward_terms] + list(task.measures)
+
+
+def whole_command(task: Task, told: Any, **named: float) -> np.ndarray:
+    """A whole command [C] from what is told of it, numbers in order or by name; the others take their default.
+
+    Raises:
+      ConfigError: names the command, the value and what would work.
+    """
+    commands = task.commands
+    if not commands:
+        raise ConfigError(f"command: task {task.name!r} takes no command")
+    if isinstance(told, Mapping):
+        told, named = (), {**told, **named}
+    known = ", ".join(f"{command.name} ({command.unit})" for command in commands)
+    if not isinstance(told, Sequence | np.ndarray) or len(told) > len(commands):
+        raise ConfigError(f"command: got {told!r}; expected at most {len(commands)} numbers: {known}")
+    values = dict(zip((command.name for command in commands), told, strict=False)) | named
+    unknown = sorted(values.keys() - {command.name for command in commands})
+    if unknown:
+        raise ConfigError(f"command: got {unknown[0]!r}; expected {known}")
+    whole = [values.get(command.name, command.default) for command in commands]
+    for command, value in zip(commands, whole, strict=True):
+        if not isinstance(value, Real):
+            raise ConfigError(f"command {command.name}: got {value!r}; expected a number, {command.unit}")
+        check_number(f"command {command.name}", value, Limits(*command.limits))
+    return np.array(whole, np.float64)

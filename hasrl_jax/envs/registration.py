@@ -9,4 +9,9 @@ def register() -> None:
     """Registers every environment with gymnasium; doing so again changes nothing."""
     for name, task in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point="hasrl_jax.envs.gymnasium:make", kwargs={"task": task})
+            gymnasium.register(
+                name,
+                entry_point="hasrl_jax.envs.gymnasium:make",
+                vector_entry_point="hasrl_jax.envs.vector:make",
+                kwargs={"task": task},
+            )

@@ -90,7 +90,7 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
       ConfigError: another task or network than the run's; RunError, CheckpointError: as `load_policy_parameters`.
     """
     trained, parameters = _from_source(source)
-    if trained.task != config.task:
+    if tasks.find(trained.task).name != tasks.find(config.task).name:  # a task that was extended keeps its name
         raise ConfigError(f"--init-policy {source}: a policy for task {trained.task}; this run's is {config.task}")
     for name in ("hidden_size", "symmetric", "normalize_observations"):
         its, ours = getattr(trained.network, name), getattr(config.network, name)

@@ -7,6 +7,7 @@ Source: paper section II.C; constants of the published implementation.
 from typing import Any
 
 from hasrl_jax.envs.cassie.settings import ClockConfig
+from hasrl_jax.envs.layout import columns
 from hasrl_jax.types import Array
 
 STAND_FORCE_CLOCK = 0.5  # of both feet while the clock rests: both planted score as one does in single stance
@@ -21,13 +22,13 @@ def cycle_seconds(speed: Array, config: ClockConfig, xp: Any) -> Array:
 def swing_fraction(speed: Array, config: ClockConfig, xp: Any) -> Array:
     """Share of half a cycle in which a foot swings, at commanded speed(s) [...] in m/s."""
     share = config.swing_fraction + config.swing_fraction_per_speed * xp.abs(speed)
-    return xp.clip(share, 0.05, config.max_swing_fraction)
+    return xp.minimum(xp.maximum(share, 0.05), config.max_swing_fraction)
 
 
 def phase_signal(phase: Array, xp: Any) -> Array:
     """The two clock inputs of the policy, sin and cos of 2 pi phase: [...] -> [..., 2]."""
     angle = 2 * xp.pi * phase
-    return xp.stack([xp.sin(angle), xp.cos(angle)], axis=-1)
+    return columns([xp.sin(angle), xp.cos(angle)], xp)
 
 
 def force_clocks(phase: Array, swing: Array, xp: Any) -> Array:
@@ -44,7 +45,7 @@ def force_clocks(phase: Array, swing: Array, xp: Any) -> Array:
     edges of different value its slope is zero at both, because the neighbouring segments are flat, so
     it equals the cubic 3u^2 - 2u^3; this closed form needs no spline per episode.
     """
-    own_phase = xp.stack([xp.mod(phase + 0.5, 1.0), phase], axis=-1)
+    own_phase = columns([xp.mod(phase + 0.5, 1.0), phase], xp)
     swings = _bump(own_phase, swing[..., None], xp)
     return swings[..., ::-1] - swings
 
@@ -63,5 +64,5 @@ def _bump(phase: Array, swing: Array, xp: Any) -> Array:
 
 
 def _smoothstep(u: Array, xp: Any) -> Array:
-    u = xp.clip(u, 0.0, 1.0)
+    u = xp.minimum(xp.maximum(u, 0.0), 1.0)  # `clip` takes NumPy twice as long
     return u * u * (3.0 - 2.0 * u)

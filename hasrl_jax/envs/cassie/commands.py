@@ -6,8 +6,8 @@ import numpy as np
 
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.envs.cassie.settings import CommandConfig, PushConfig
-from hasrl_jax.envs.draws import between
-from hasrl_jax.envs.layout import NEGATED, SAME, Entry
+from hasrl_jax.envs.draws import between, redrawn
+from hasrl_jax.envs.layout import NEGATED, SAME, Entry, columns
 from hasrl_jax.envs.task import Command
 from hasrl_jax.types import Array
 
@@ -73,7 +73,7 @@ def _draw_in_world(uniforms: Array, config: CommandConfig, _: float, xp: Any) ->
     forward = between(uniforms[..., 0], config.forward_m_s)
     lateral = between(uniforms[..., 1], config.lateral_m_s)
     stand = uniforms[..., 2:3] < config.stand_probability
-    return xp.where(stand, 0.0, xp.stack([forward, lateral], axis=-1))
+    return xp.where(stand, 0.0, columns([forward, lateral], xp))
 
 
 def _draw_in_heading(uniforms: Array, config: CommandConfig, usual_height_m: float, xp: Any) -> Array:
@@ -100,14 +100,30 @@ def _draw_in_heading(uniforms: Array, config: CommandConfig, usual_height_m: flo
     low, high = config.height_fade_m_s
     share = xp.clip((high - speed) / max(high - low, 1e-6), 0.0, 1.0) * has_height
     height = usual_height_m + share * (height - usual_height_m)
-    return xp.stack([forward, lateral, yaw_rate, height], axis=-1)
+    return columns([forward, lateral, yaw_rate, height], xp)
+
+
+def next_command(
+    command: Array,
+    command_s: Array,
+    elapsed_s: Array,
+    uniforms: Array,
+    config: CommandConfig,
+    usual_height_m: float,
+    xp: Any,
+) -> tuple[Array, Array]:
+    """The command [..., C] and the time until the next draw [...] after `elapsed_s`."""
+    due = command_s <= elapsed_s
+    kept = command, command_s - elapsed_s
+    command, command_s = redrawn(due, lambda: draw_command(uniforms, config, usual_height_m, xp), kept, xp)
+    return command, command_s
 
 
 def draw_push(uniforms: Array, config: PushConfig, xp: Any) -> tuple[Array, Array]:
     """Uniform numbers [..., 3] to a force [..., 2] in N, in any horizontal direction, and the seconds until it acts."""
     size = between(uniforms[..., 0:1], config.force_n)
     angle = 2 * np.pi * uniforms[..., 1]
-    force = size * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
+    force = size * columns([xp.cos(angle), xp.sin(angle)], xp)
     return force, between(uniforms[..., 2], config.interval_s)
 
 
@@ -117,5 +133,5 @@ def next_push(
     """The push [..., 2] and the time until it [...] after `elapsed_s`; one that is over gives way to a new draw."""
     remaining = push_s - elapsed_s
     over = remaining <= -config.duration_s + ROUNDING_S
-    drawn, drawn_s = draw_push(uniforms, config, xp)
-    return xp.where(over[..., None], drawn, push), xp.where(over, drawn_s, remaining)
+    push, remaining = redrawn(over, lambda: draw_push(uniforms, config, xp), (push, remaining), xp)
+    return push, remaining

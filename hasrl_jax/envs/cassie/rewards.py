@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hasrl_jax.envs.cassie.settings import RewardConfig
+from hasrl_jax.envs.layout import columns
 from hasrl_jax.types import Array
 
 SCORES = ("foot_force", "foot_velocity")
@@ -105,6 +106,6 @@ def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> A
     `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
     non-negative error E whose exp(-E) is rewarded.
     """
-    values = xp.stack([errors[name] for name in TERMS], axis=-1)
+    values = columns([errors[name] for name in TERMS], xp)
     values = xp.concatenate([values[..., : len(SCORES)], xp.exp(-values[..., len(SCORES) :])], axis=-1)
     return values * np.array([config.scale * getattr(config, name) for name in TERMS])

@@ -232,7 +232,7 @@ def delay(state: CassieState, xp: Any) -> tuple[Array, Array]:
 
 def control(state: CassieState, action: Array, xp: Any) -> Array:
     """PD targets in rad, [..., 10]. The encoder offset enters because the PD loop reads the same encoder."""
-    return xp.clip(action, -1.0, 1.0) + NEUTRAL_RAD - state.encoder_offset[..., :ACTION_SIZE]
+    return xp.minimum(xp.maximum(action, -1.0), 1.0) + NEUTRAL_RAD - state.encoder_offset[..., :ACTION_SIZE]
 
 
 def force(constants: Constants, state: CassieState, xp: Any) -> Array:
@@ -280,28 +280,29 @@ def step(
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
     yaw = frames.heading(quat, xp)
-    measured = [velocity[..., :2], xp.stack([told["forward"], told["lateral"], height, yaw], axis=-1)]
+    measured = [velocity[..., :2], layout.columns([told["forward"], told["lateral"], height, yaw], xp)]
     measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
     if config.command.frame == "heading":
         yaw_rate = (up * reading.qvel[..., 3:6]).sum(axis=-1)
         error = frames.wrapped(yaw - state.target_heading, xp)
-        measured.append(xp.stack([yaw_rate, told["yaw_rate"], told["height"], error], axis=-1))
+        measured.append(layout.columns([yaw_rate, told["yaw_rate"], told["height"], error], xp))
     measures = xp.concatenate(measured, axis=-1)
 
-    drawn_sizes = commands.num_uniforms(config.command), commands.PUSH_UNIFORMS
-    command_u, push_u, noise_u = xp.split(uniforms, np.cumsum(drawn_sizes), axis=-1)
-    drawn, drawn_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
-    push, push_s = commands.next_push(state.push, state.push_s, state.env_step_s, push_u, config.push, xp)
-    due = state.command_s <= state.env_step_s
+    drawn, elapsed_s = commands.num_uniforms(config.command), state.env_step_s
+    command_u, push_u = uniforms[..., :drawn], uniforms[..., drawn : drawn + commands.PUSH_UNIFORMS]
+    noise_u = uniforms[..., drawn + commands.PUSH_UNIFORMS :]
+    push, push_s = commands.next_push(state.push, state.push_s, elapsed_s, push_u, config.push, xp)
+    command, command_s = commands.next_command(
+        state.command, state.command_s, elapsed_s, command_u, config.command, config.reward.height_m, xp
+    )
     cycle_s = clock.cycle_seconds(told["forward"], config.clock, xp)
     # The clock counts environment steps, as the published one does, not randomised seconds.
     phase = xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0)
-    command = xp.where(due[..., None], drawn, state.command)
     state = state._replace(
         phase=xp.where(state.standing, state.phase, phase),
         standing=is_standing(config, command, velocity, xp),
         command=command,
-        command_s=xp.where(due, drawn_s, state.command_s - state.env_step_s),
+        command_s=command_s,
         push=push,
         push_s=push_s,
         action=action,
@@ -415,9 +416,11 @@ def reward_errors(
     told = commands.named(state.command, config.command)
     speed = told["forward"]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
-    standing = state.standing[..., None]
-    force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
-    most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, rewards.MAX_FOOT_FORCE_N)
+    most_force: Array | float = rewards.MAX_FOOT_FORCE_N
+    if config.command.frame == "heading":  # elsewhere the clock never rests
+        standing = state.standing[..., None]
+        force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
+        most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     height = height_above_ground(constants, state, reading.qpos, xp)
     orientation = pelvis_orientation(constants, state, reading.qpos, xp)
@@ -445,8 +448,8 @@ def reward_errors(
         ),
         "velocity": settings.velocity_sharpness * speed_error,
         "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
-        "torque_change": 0.25 * torque_change.mean(axis=-1),
-        "action_change": 5 * xp.abs(action - state.action).mean(axis=-1),
+        "torque_change": 0.25 * (torque_change.sum(axis=-1) / ACTION_SIZE),
+        "action_change": 5 * (xp.abs(action - state.action).sum(axis=-1) / ACTION_SIZE),
     }
 
 

@@ -1,0 +1,1 @@
+"""A planar robot with two legs, from the MJCF that lies inside gymnasium."""
