@@ -273,12 +273,50 @@ def _moved(state: ppo.LearnerState, by: float) -> Any:
 
 def test_fresh_data_gives_exactly_the_ordinary_loss() -> None:
     state, _ = _learner(_config())
-    plain, corrected = _correct()(state, _fresh(state, LENGTHS))
-    np.testing.assert_array_equal(corrected.proximal_log_prob, plain.trajectory.log_prob)
+    trajectory = _fresh(state, LENGTHS)
+    plain, corrected = _correct()(state, trajectory)
+    np.testing.assert_array_equal(corrected.proximal_log_prob, trajectory.log_prob)
     np.testing.assert_array_equal(corrected.importance, 1.0)
-    params = _moved(state, 0.02)
-    for left, right in zip(*(_numbers(_loss(params, state, batch)) for batch in (plain, corrected)), strict=True):
-        np.testing.assert_array_equal(left, right)
+    params, mask = _moved(state, 0.2), trajectory.mask
+    loss, metrics = _loss(params, state, corrected)
+    inputs = trajectory.observation, trajectory.initial_carry, trajectory.is_first
+    mean = np.asarray(_networks(NETWORK)[0](params, *inputs, *normalize.mean_std(state.normalizer)), np.float64)
+    log_std = np.asarray(params["log_std"], np.float64)
+    density = np.exp(-0.5 * ((trajectory.action - mean) / np.exp(log_std)) ** 2 - log_std) / np.sqrt(2 * np.pi)
+    ratio = density.prod(axis=-1)[mask] / np.exp(trajectory.log_prob[mask])
+    assert ratio.min() < 0.8 and ratio.max() > 1.2
+    advantage = np.asarray(plain.advantage, np.float64)[mask]
+    bounded = np.where(advantage > 0, np.minimum(ratio, 1.2), np.maximum(ratio, 0.8))
+    entropy = (log_std + 0.5 * np.log(2 * np.pi * np.e)).sum()
+    np.testing.assert_allclose(loss, -(bounded * advantage).mean() - 0.01 * entropy, rtol=1e-4)
+    np.testing.assert_allclose(metrics["clip_fraction"], np.mean((ratio < 0.8) | (ratio > 1.2)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "surrogate"),
+    [
+        (1.5, 2.0, 2.4),  # better and far enough: 1.2 * 2
+        (1.5, -2.0, -3.0),  # worse and more likely: all of it counts
+        (0.5, 2.0, 1.0),  # better and less likely: all of it counts
+        (0.5, -2.0, -1.6),  # worse and far enough: 0.8 * -2
+        (1.1, 2.0, 2.2),
+        (0.9, -2.0, -1.8),
+        (0.0, -1.0, -0.8),
+        (np.inf, -1.0, -np.exp(20.0)),  # stays finite
+    ],
+)
+def test_the_clipped_surrogate_by_hand(ratio: float, advantage: float, surrogate: float) -> None:
+    state, _ = _learner(_config())
+    batch, _ = losses.prepare_batch(jax.tree.map(jnp.asarray, _fresh(state, LENGTHS)), PPO)
+    with np.errstate(divide="ignore"):
+        proximal = batch.trajectory.log_prob - np.float32(np.log(ratio))
+    full = jnp.full((B, T), advantage)
+    policy, _ = make_networks(NETWORK, OBSERVATION, ACTION, None)
+    arguments = batch._replace(proximal_log_prob=proximal, advantage=full), *normalize.mean_std(state.normalizer)
+    ppo_config = dataclasses.replace(PPO, entropy_coefficient=0.0)
+    loss, metrics = losses.policy_loss(state.policy_params, policy, *arguments, ppo_config)
+    np.testing.assert_allclose(loss, -surrogate, rtol=1e-5)
+    assert float(metrics["clip_fraction"]) == (not 0.8 < ratio < 1.2)
 
 
 def test_stale_data_is_weighted_and_clipped_around_the_policy_before_the_update() -> None:
