@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from hasrl_jax.cli import parsing as cli
-from hasrl_jax.cli.options import OneLineParser
+from hasrl_jax.cli.options import OneLineParser, require_writable
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
@@ -21,6 +21,7 @@ def export(arguments: list[str]) -> None:
     parser.add_argument("--run-dir", type=Path, required=True, help="a run directory")
     parser.add_argument("--out", type=Path, required=True, help="the file to write, .npz")
     known, rest = parser.parse_known_args(arguments)
+    require_writable("--out", known.out, ".npz")
     settings, parameters = policies.load_policy_parameters(known.run_dir, None)
     # Where it was trained is nobody's business, and its curriculum is over.
     settings = cli.override_for_policy(from_dict({"run_dir": "", "stages": []}, settings), rest, "export")

@@ -26,6 +26,7 @@ from hasrl_jax.errors import ConfigError, DivergenceError
 from hasrl_jax.types import Array, Record, Trajectory
 
 log = logging.getLogger("hasrl_jax")
+_ENVIRONMENTS = 0x456E7673  # folded into the seed
 
 
 class MjxPlan(NamedTuple):
@@ -121,6 +122,11 @@ def make_mjx_plan(config: Config, num_envs: int, num_devices: int) -> MjxPlan:
     return MjxPlan(num_envs, pieces * collect.unroll_length, collect.unroll_length, config.network.carry_shape)
 
 
+def environment_keys(seed: int, num_envs: int) -> Array:
+    """A key for each environment, [num_envs, 2] uint32; apart from those that the learner splits from the same seed."""
+    return jax.random.split(jax.random.fold_in(jax.random.PRNGKey(seed), _ENVIRONMENTS), num_envs)
+
+
 class MjxRollout:
     """`collect(parameters, state, version) -> (state, trajectory, statistics)`: one iteration's experience.
 
@@ -160,8 +166,7 @@ class MjxRollout:
             # Types as a collection returns them, none of them weak: the second call would be compiled anew.
             return jax.tree.map(lambda array: jnp.asarray(array, array.dtype), state)
 
-        keys = jax.random.split(jax.random.PRNGKey(seed), self.plan.num_envs)
-        return jax.jit(jax.vmap(begin), out_shardings=self._split)(keys)
+        return jax.jit(jax.vmap(begin), out_shardings=self._split)(environment_keys(seed, self.plan.num_envs))
 
     def __call__(
         self, parameters: ActingParameters, state: CollectorState, version: Array | int

@@ -150,13 +150,13 @@ class Update:
         self._split = NamedSharding(mesh, PartitionSpec("data"))
         self._jitted = jax.jit(
             self._iteration,
-            in_shardings=(self._replicated, self._split, self._replicated),
+            in_shardings=(self._replicated, self._split, self._replicated, self._replicated),
             out_shardings=(self._replicated, self._replicated),
             donate_argnums=0,
         )
 
     def __call__(
-        self, state: LearnerState, trajectory: Trajectory, replayed: bool = False
+        self, state: LearnerState, trajectory: Trajectory, replayed: bool = False, progress: float = 0.0
     ) -> tuple[LearnerState, Metrics]:
         """Runs the program.
 
@@ -164,6 +164,7 @@ class Update:
           state: the learner; donated.
           trajectory: [B, T, ...], see `Trajectory`.
           replayed: it was learnt from before, so steps and observation statistics do not count it again.
+          progress: share of the run's environment steps that were collected before; a linear learning rate counts it.
 
         Raises:
           ValueError: B, the minibatch size and the number of devices do not divide each other.
@@ -176,10 +177,11 @@ class Update:
             )
         # Placed here rather than by jit, so that the first call and all later ones share one compiled program.
         state = jax.device_put(state, self._replicated)
-        return self._jitted(state, jax.device_put(trajectory, self._split), np.asarray(not replayed))
+        numbers = np.asarray(not replayed), np.float32(progress)
+        return self._jitted(state, jax.device_put(trajectory, self._split), *numbers)
 
     def _iteration(
-        self, state: LearnerState, trajectory: Trajectory, counts: jax.Array
+        self, state: LearnerState, trajectory: Trajectory, counts: jax.Array, progress: jax.Array
     ) -> tuple[LearnerState, Metrics]:
         """Advantages once, then all epochs and minibatches, then the observation statistics."""
         self.trace_count += 1
@@ -194,7 +196,7 @@ class Update:
             metrics |= importance
         scale = jnp.ones(())
         if ppo.learning_rate_schedule == "linear":
-            scale = jnp.maximum(0.0, 1.0 - state.env_steps.astype(jnp.float32) / config.total_env_steps)
+            scale = jnp.maximum(0.0, 1.0 - progress)
         key, *epoch_keys = jax.random.split(state.key, 1 + ppo.epochs)
         rows, size = batch.target.shape[0], ppo.minibatch_trajectories
         indices = jnp.concatenate([minibatch_indices(epoch_key, rows, size) for epoch_key in epoch_keys])

@@ -177,13 +177,14 @@ def run_iterations(
             except WorkerError:
                 save_what_is_finished(config, run.checkpoints, RunState(learner, progress))
                 raise
+            share = progress.env_steps / config.total_env_steps
             progress = progress._replace(env_steps=progress.env_steps + experience.env_steps)
             goes_on = not ended(config, progress) and not stop and not stages.due(progress.env_steps)
             if config.schedule == "overlap" and goes_on and collecting == stages.current:
                 collector.start(acting_parameters(config, learner), progress.iteration + 1, version=progress.iteration)
 
             update_started = time.monotonic()
-            learner, metrics = learn(part.update, learner, experience, progress.iteration + 1)
+            learner, metrics = learn(part.update, learner, experience, share, progress.iteration + 1)
             now = time.monotonic()
             seconds = progress.seconds + now - started
             progress = progress._replace(iteration=progress.iteration + 1, seconds=seconds)
@@ -230,9 +231,16 @@ def sizes(task: Task) -> tuple[int, int, Mirror | None]:
 
 
 def learn(
-    update: ppo.Update, learner: ppo.LearnerState, experience: Experience, iteration: int
+    update: ppo.Update, learner: ppo.LearnerState, experience: Experience, share: float, iteration: int
 ) -> tuple[ppo.LearnerState, Record]:
     """One update, finished when this returns.
+
+    Args:
+      update: the program.
+      learner: donated.
+      experience: to learn from.
+      share: of the run's environment steps, collected before.
+      iteration: for messages.
 
     Raises:
       DivergenceError: it gave parameters that are not finite.
@@ -240,7 +248,7 @@ def learn(
     """
     resume = "nothing of it is saved; use --resume"
     try:
-        learner, result = update(learner, experience.trajectory, experience.replayed)
+        learner, result = update(learner, experience.trajectory, experience.replayed, share)
         record: Record = {name: float(value) for name, value in result.items()}  # waits for the update to finish
     except jax.errors.JaxRuntimeError as error:
         cause = str(error).partition("\n")[0]

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from hasrl_jax.collect import shared_memory
-from hasrl_jax.collect.mjx import ActingParameters, CollectorState, MjxCollector, MjxRollout, Statistics, make_mjx_plan
+from hasrl_jax.collect.mjx import (
+    ActingParameters,
+    CollectorState,
+    MjxCollector,
+    MjxRollout,
+    Statistics,
+    environment_keys,
+    make_mjx_plan,
+)
 from hasrl_jax.collect.protocol import Networks
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
@@ -39,6 +47,17 @@ CONFIG = from_dict(
     }
 )
 SEED, VERSION = 3, 5
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("num_envs", [1, 3, 64])
+def test_no_environment_has_a_key_of_the_learner(seed: int, num_envs: int) -> None:
+    environments = {tuple(key) for key in np.asarray(environment_keys(seed, num_envs)).tolist()}
+    assert len(environments) == num_envs
+    root = jax.random.key(seed)  # as in `train`; the learner goes on with the last of three
+    learner = [root, *jax.random.split(root, 3)]
+    learner += list(jax.random.split(learner[-1], 1 + CONFIG.ppo.epochs))
+    assert not environments & {tuple(jax.random.key_data(key).tolist()) for key in learner}
 
 
 def _fragile_task() -> Task:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.config import tasks
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.tasks import find
@@ -134,6 +135,16 @@ def test_the_programs_train_and_evaluate_it_by_its_recipe(elsewhere: Path) -> No
     records = [json.loads(line) for line in (elsewhere / "run" / "metrics.jsonl").read_text().splitlines()]
     assert records[-1]["env_steps"] == 256 and records[-1]["reward/near"] > 0
     assert "episode_return" in run("hasrl_jax.evaluate", "--run-dir", "run", "--episodes", "2", "--seconds", "0.5")
+
+
+def test_a_symmetric_network_for_a_task_without_a_mirror_is_one_line(
+    elsewhere: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert train_main(["--task", "slider", "--network.symmetric", "True", "--run-dir", str(run)]) == 2
+    expected = "error: network.symmetric: got True; expected False with task slider, which defines no mirror\n"
+    assert capsys.readouterr().err.endswith(expected)
+    assert not run.exists()
 
 
 @pytest.mark.parametrize(

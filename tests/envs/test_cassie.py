@@ -313,6 +313,84 @@ def test_the_clock_advances_by_one_environment_step() -> None:
     np.testing.assert_allclose(result.state.phase, 0.99 + 0.025 / 0.9 - 1)
 
 
+def test_control_by_hand() -> None:
+    task, _ = _make()
+    fresh = task.reset(np.full((2, task.reset_uniforms), 0.5), np)
+    offset = np.zeros((2, 16))
+    offset[1, :10] = 0.01 * np.arange(10)
+    state = fresh.state._replace(encoder_offset=offset)
+    action = np.array([[0.5, -0.5, 1.0, -1.0, 1.5, -7.0, 0.0, 0.0, 0.0, 0.0], 10 * [0.0]])
+    neutral = [0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968]
+    expected = np.array([neutral, neutral])
+    expected[0] += [0.5, -0.5, 1.0, -1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0]  # 1.5 and -7 are cut off
+    expected[1] -= [0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09]
+    np.testing.assert_allclose(task.control(state, action, np), expected, atol=1e-12)
+
+
+def test_the_policy_reads_the_encoder_that_its_targets_are_tracked_with() -> None:
+    """A motor that has reached its target is seen where the policy asked it to be, whatever the encoder's offset."""
+    task, constants = _make()
+    fresh = task.reset(np.random.default_rng(2).random((1, task.reset_uniforms)), np)
+    assert np.abs(fresh.state.encoder_offset).min() > 0
+    asked = np.linspace(-0.4, 0.5, 10)[None]
+    qpos = fresh.qpos.copy()
+    qpos[0, constants.ids.motor_qpos] = task.control(fresh.state, asked, np)[0]
+    result = task.step(fresh.state, asked, _still_reading(task, qpos), np.zeros((1, task.step_uniforms)), np)
+    np.testing.assert_allclose(result.observation[0, 5:15], cassie.NEUTRAL_RAD + asked[0], atol=1e-12)
+
+
+def test_changes_of_action_and_torque_count_from_the_step_before() -> None:
+    task, constants = _make(**NOMINAL_ROBOT)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    changes = [task.reward_terms.index(name) for name in ("torque_change", "action_change")]
+    state, terms = fresh.state, []
+    for torque, action in ((4.0, 0.1), (-2.0, 0.3), (-2.0, 1.5)):  # N m, the same for all motors
+        reading = _still_reading(task, fresh.qpos)
+        reading.sensordata[0, constants.ids.torque] = torque
+        result = task.step(state, np.full((1, 10), action), reading, np.zeros((1, task.step_uniforms)), np)
+        state = result.state
+        terms.append(result.reward_terms[0, changes])
+    # 2 * 0.025 * e^(-0.25 |change of torque|) and 2 * 0.025 * e^(-5 |change of action|); both begin at 0.
+    np.testing.assert_allclose(terms, 0.05 * np.exp([[-1.0, -0.5], [-1.5, -1.0], [0.0, -6.0]]))
+
+
+def test_a_step_is_judged_by_the_command_that_was_held_in_it() -> None:
+    task, _ = _make(command={"resample_s": [2.0, 6.0], "stand_probability": 0.0}, **NOMINAL_ROBOT)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    held = fresh.state._replace(command=np.array([[0.6, 0.05]]), command_s=np.zeros(1), phase=np.array([0.2]))
+    uniforms = np.array([[1.0, 0.0, 0.9, 0.25, 0.0, 0.0, 0.0]])  # draws 2 m/s ahead, 0.1 m/s to the right
+    result = task.step(held, np.zeros((1, 10)), _still_reading(task, fresh.qpos), uniforms, np)
+    np.testing.assert_allclose(result.state.command, [[2.0, -0.1]])
+    np.testing.assert_allclose(result.state.phase, 0.2 + 0.025 / (0.9 - 0.25 / 3 * 0.6))
+    np.testing.assert_allclose(result.state.path, [[0.025 * 0.6, 0.025 * 0.05]])
+    speed_error = 0.6 + 0.05  # of a robot that stands
+    velocity = task.reward_terms.index("velocity")
+    np.testing.assert_allclose(result.reward_terms[0, velocity], 2 * 0.15 * np.exp(-speed_error))
+    measures = dict(zip(task.measures, result.measures[0], strict=True))
+    assert (measures["forward_command"], measures["lateral_command"]) == (0.6, 0.05)
+
+
+def test_times_and_distances_follow_the_episode_s_own_step_and_the_clock_does_not() -> None:
+    """A randomised physics rate changes how long an environment step lasts."""
+    task, _ = _make(push={"force_n": [50.0, 50.0]})
+    fresh = task.reset(np.full((2, task.reset_uniforms), 0.5), np)
+    step_s = np.array([0.02, 0.04])
+    state = fresh.state._replace(
+        env_step_s=step_s,
+        command=np.array([[1.0, -0.1], [1.0, -0.1]]),
+        command_s=np.array([3.0, 3.0]),
+        push_s=np.array([2.0, 2.0]),
+        phase=np.array([0.5, 0.5]),
+    )
+    for _ in range(2):
+        reading = _still_reading(task, fresh.qpos)
+        state = task.step(state, np.zeros((2, 10)), reading, np.zeros((2, task.step_uniforms)), np).state
+    np.testing.assert_allclose(state.path, [[0.04, -0.004], [0.08, -0.008]])
+    np.testing.assert_allclose(state.command_s, [2.96, 2.92])
+    np.testing.assert_allclose(state.push_s, [1.96, 1.92])
+    np.testing.assert_allclose(state.phase, 0.5 + 2 * 0.025 / (0.9 - 0.25 / 3))
+
+
 @pytest.mark.parametrize("command", [{}, HEADING])
 def test_numpy_equals_jax(command: dict) -> None:
     task, envs, state, action = _moving_state(command=command)

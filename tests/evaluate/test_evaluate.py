@@ -15,10 +15,12 @@ from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs
+from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import rollout, statistics
 from hasrl_jax.learn import ppo
+from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 
@@ -63,6 +65,87 @@ def test_a_step_that_diverged_does_not_count(policy, monkeypatch):
     assert np.isfinite(episodes.episode_return).all()
     assert np.isnan(episodes.measures[2:, 0]).all()
     assert statistics.summarize(episodes, task)["diverged_episodes"] == 1
+
+
+def test_nothing_counts_after_a_fall(policy, monkeypatch):
+    """Environments begin anew by themselves; the second life of one that fell is not the episode's."""
+    config, parameters = policies.load_policy_parameters(None, policy)
+    config = from_dict({"collect": {"max_episode_steps": 6}}, config)
+    task = make_task(config)
+    step, calls = CpuEnvs.step, []
+
+    def scripted(self, state, action, rng):
+        state, result = step(self, state, action, rng)
+        calls.append(1)
+        fell = np.array([len(calls) in (2, 4), False, len(calls) == 6])
+        reward = np.array([10.0 ** len(calls), 1.0, 2.0])
+        return state, result._replace(reward=reward, terminated=fell, truncated=np.zeros(3, bool))
+
+    monkeypatch.setattr(CpuEnvs, "step", scripted)
+    episodes = rollout.run_episodes(config, task, parameters, 3, seed=0)
+    np.testing.assert_array_equal(episodes.episode_return, [110.0, 6.0, 12.0])
+    np.testing.assert_array_equal(episodes.episode_length, [2, 6, 6])
+    np.testing.assert_array_equal(episodes.reached_cap, [False, True, False])  # the third falls in its last step
+    np.testing.assert_allclose(episodes.seconds, [0.05, 0.15, 0.15])
+    assert len(calls) == 6
+    present = np.isfinite(episodes.measures).all(axis=2)
+    np.testing.assert_array_equal(present.sum(axis=0), [2, 6, 6])
+    assert present[:2, 0].all()
+
+
+def test_the_memory_is_kept_from_step_to_step(policy, monkeypatch):
+    """The actions of whole episodes against those of the learner's network on the whole sequence."""
+    config, parameters = policies.load_policy_parameters(None, policy)
+    config = from_dict({"collect": {"max_episode_steps": 12}}, config)
+    parameters = parameters | {"policy/mean_kernel": 50 * parameters["policy/mean_kernel"]}
+    task = make_task(config)
+    network, _ = make_networks(config.network, task.observation_size, task.action_size, None)
+    weights = {name.removeprefix("policy/"): x for name, x in parameters.items() if name.startswith("policy/")}
+    statistics = parameters["normalizer/mean"], parameters["normalizer/std"]
+    step, seen = CpuEnvs.step, []
+
+    def recorded(self, state, action, rng):
+        seen.append((state.observation, state.is_first, action))
+        return step(self, state, action, rng)
+
+    def expected(observation, is_first):
+        return network.apply({"params": weights}, observation, None, is_first, *statistics)[0]
+
+    monkeypatch.setattr(CpuEnvs, "step", recorded)
+    rollout.run_episodes(config, task, parameters, 3, seed=0)
+    observation, is_first, action = (np.stack(parts, axis=1) for parts in zip(*seen, strict=True))
+    np.testing.assert_allclose(action, expected(observation, is_first), atol=1e-5)
+    forgetful = np.ones_like(is_first)
+    assert np.abs(action - expected(observation, forgetful)).max() > 0.01
+    seen.clear()
+    player = rollout.Player(TaskEnv(config), parameters, seed=0)
+    for _ in range(12):
+        player.step()
+    observation, is_first, action = (np.stack(parts, axis=1) for parts in zip(*seen, strict=True))
+    np.testing.assert_allclose(action, expected(observation, is_first), atol=1e-5)
+
+
+def test_intervals_by_hand():
+    # 2.5 +- 1.96 * sqrt(5/3) / sqrt(4); what is not a number does not count.
+    found = statistics.mean_interval(np.array([1.0, np.nan, 2.0, 3.0, 4.0, np.inf]))
+    np.testing.assert_allclose([found["mean"], found["low"], found["high"]], [2.5, 1.234826, 3.765174], atol=1e-6)
+    assert statistics.mean_interval(np.array([3.0])) == {"mean": 3.0, "low": 3.0, "high": 3.0}
+    assert statistics.mean_interval(np.array([np.nan])) == {"mean": None, "low": None, "high": None}
+
+
+@pytest.mark.parametrize(
+    ("hits", "of", "low", "high"),
+    [
+        (8, 10, 0.490157, 0.943319),  # (0.8 + 0.19208 -+ 1.96 sqrt(0.016 + 0.009604)) / 1.38416
+        (0, 10, 0.0, 0.277540),
+        (10, 10, 0.722460, 1.0),
+        (50, 100, 0.403830, 0.596170),
+    ],
+)
+def test_wilson_intervals_by_hand(hits, of, low, high):
+    found = statistics.share_interval(np.arange(of) < hits)
+    np.testing.assert_allclose([found["mean"], found["low"], found["high"]], [hits / of, low, high], atol=1e-6)
+    assert statistics.share_interval(np.zeros(0, bool)) == {"mean": None, "low": None, "high": None}
 
 
 def test_a_speed_error_does_not_cancel_between_commands():

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.schema import Config, NetworkConfig, PPOConfig
-from hasrl_jax.learn import distributions, losses, normalize, ppo
+from hasrl_jax.learn import distributions, losses, networks, normalize, ppo
 from hasrl_jax.learn.networks import make_networks, zero_carry
-from hasrl_jax.types import Trajectory
+from hasrl_jax.types import Mirror, Trajectory
 
 OBSERVATION, ACTION, H, B, T = 5, 2, 8, 16, 6
 NETWORK = NetworkConfig(hidden_size=H)
@@ -141,6 +141,34 @@ def test_one_device_and_eight_give_the_same_update() -> None:
         np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-5)
 
 
+def test_one_device_and_eight_give_the_same_update_of_a_symmetric_network_that_stops_on_the_way() -> None:
+    """With lost steps in the middle of rows, GAE, stale rows and a KL limit that a later minibatch exceeds."""
+    rng = np.random.default_rng(4)
+    mirror = Mirror(np.array([1, 0, 2, 4, 3]), np.array([1, 1, -1, 1, 1]), np.array([1, 0]), np.array([1, 1]))
+    config = _config(network={"symmetric": True}, max_kl=0.01, policy_learning_rate=0.05, gae_lambda=0.7, epochs=3)
+    config = dataclasses.replace(config, schedule="decoupled")
+    mask = (np.arange(T) < LENGTHS[:, None]) & (rng.random((B, T)) < 0.8)
+    steps = _fresh(_learner(_config())[0], LENGTHS)
+    carry = rng.normal(0, 0.3, zero_carry(B, H, symmetric=True).shape).astype(np.float32)
+    version = rng.integers(0, 3, B).astype(np.int32)
+    cut = rng.random((B, T)) < 0.2
+    results = []
+    for devices in (1, 8):
+        sizes = OBSERVATION, ACTION, mirror
+        state = ppo.init_learner(config, *sizes, jax.random.PRNGKey(0))._replace(update_count=jnp.int32(2))
+        policy, _ = make_networks(config.network, *sizes)
+        mean = policy.apply({"params": state.policy_params}, steps.observation, carry, steps.is_first)[0]
+        log_prob = distributions.log_prob(steps.action, mean, networks.log_std(policy, state.policy_params))
+        trajectory = steps._replace(
+            mask=mask, initial_carry=carry, policy_version=version, truncated=steps.truncated | cut, log_prob=log_prob
+        )
+        update = ppo.make_update(config, *sizes, ppo.make_mesh(jax.devices()[:devices]))
+        results.append(update(state, jax.tree.map(np.asarray, trajectory)))
+    assert 0 < float(results[0][1]["policy_updates"]) < 6
+    for left, right in zip(*map(_numbers, results), strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-3, atol=2e-3 * 0.05)
+
+
 def test_same_seed_same_numbers_and_no_recompile() -> None:
     results = []
     for _ in range(2):
@@ -173,11 +201,10 @@ def test_max_kl_linear_schedule_and_fixed_deviation() -> None:
     config = _config(
         network={"learn_std": False}, max_kl=1e-7, policy_learning_rate=0.05, learning_rate_schedule="linear"
     )
-    config = dataclasses.replace(config, total_env_steps=2 * int(LENGTHS.sum()))
     state, update = _learner(config)
     value_before, rates, applied = _numbers(state.value_params), [], []
     for seed in range(3):
-        state, metrics = update(state, _fresh(state, LENGTHS, seed))
+        state, metrics = update(state, _fresh(state, LENGTHS, seed), progress=seed / 2)
         rates.append(float(metrics["learning_rate"]) / config.ppo.policy_learning_rate)
         applied.append(float(metrics["policy_updates"]))
     np.testing.assert_allclose(rates, [1.0, 0.5, 0.0], atol=1e-6)
@@ -273,12 +300,50 @@ def _moved(state: ppo.LearnerState, by: float) -> Any:
 
 def test_fresh_data_gives_exactly_the_ordinary_loss() -> None:
     state, _ = _learner(_config())
-    plain, corrected = _correct()(state, _fresh(state, LENGTHS))
-    np.testing.assert_array_equal(corrected.proximal_log_prob, plain.trajectory.log_prob)
+    trajectory = _fresh(state, LENGTHS)
+    plain, corrected = _correct()(state, trajectory)
+    np.testing.assert_array_equal(corrected.proximal_log_prob, trajectory.log_prob)
     np.testing.assert_array_equal(corrected.importance, 1.0)
-    params = _moved(state, 0.02)
-    for left, right in zip(*(_numbers(_loss(params, state, batch)) for batch in (plain, corrected)), strict=True):
-        np.testing.assert_array_equal(left, right)
+    params, mask = _moved(state, 0.2), trajectory.mask
+    loss, metrics = _loss(params, state, corrected)
+    inputs = trajectory.observation, trajectory.initial_carry, trajectory.is_first
+    mean = np.asarray(_networks(NETWORK)[0](params, *inputs, *normalize.mean_std(state.normalizer)), np.float64)
+    log_std = np.asarray(params["log_std"], np.float64)
+    density = np.exp(-0.5 * ((trajectory.action - mean) / np.exp(log_std)) ** 2 - log_std) / np.sqrt(2 * np.pi)
+    ratio = density.prod(axis=-1)[mask] / np.exp(trajectory.log_prob[mask])
+    assert ratio.min() < 0.8 and ratio.max() > 1.2
+    advantage = np.asarray(plain.advantage, np.float64)[mask]
+    bounded = np.where(advantage > 0, np.minimum(ratio, 1.2), np.maximum(ratio, 0.8))
+    entropy = (log_std + 0.5 * np.log(2 * np.pi * np.e)).sum()
+    np.testing.assert_allclose(loss, -(bounded * advantage).mean() - 0.01 * entropy, rtol=1e-4)
+    np.testing.assert_allclose(metrics["clip_fraction"], np.mean((ratio < 0.8) | (ratio > 1.2)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "surrogate"),
+    [
+        (1.5, 2.0, 2.4),  # better and far enough: 1.2 * 2
+        (1.5, -2.0, -3.0),  # worse and more likely: all of it counts
+        (0.5, 2.0, 1.0),  # better and less likely: all of it counts
+        (0.5, -2.0, -1.6),  # worse and far enough: 0.8 * -2
+        (1.1, 2.0, 2.2),
+        (0.9, -2.0, -1.8),
+        (0.0, -1.0, -0.8),
+        (np.inf, -1.0, -np.exp(20.0)),  # stays finite
+    ],
+)
+def test_the_clipped_surrogate_by_hand(ratio: float, advantage: float, surrogate: float) -> None:
+    state, _ = _learner(_config())
+    batch, _ = losses.prepare_batch(jax.tree.map(jnp.asarray, _fresh(state, LENGTHS)), PPO)
+    with np.errstate(divide="ignore"):
+        proximal = batch.trajectory.log_prob - np.float32(np.log(ratio))
+    full = jnp.full((B, T), advantage)
+    policy, _ = make_networks(NETWORK, OBSERVATION, ACTION, None)
+    arguments = batch._replace(proximal_log_prob=proximal, advantage=full), *normalize.mean_std(state.normalizer)
+    ppo_config = dataclasses.replace(PPO, entropy_coefficient=0.0)
+    loss, metrics = losses.policy_loss(state.policy_params, policy, *arguments, ppo_config)
+    np.testing.assert_allclose(loss, -surrogate, rtol=1e-5)
+    assert float(metrics["clip_fraction"]) == (not 0.8 < ratio < 1.2)
 
 
 def test_stale_data_is_weighted_and_clipped_around_the_policy_before_the_update() -> None:

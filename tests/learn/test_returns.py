@@ -42,6 +42,21 @@ def test_gae_setting_by_hand() -> None:
     np.testing.assert_allclose(target[:5], expected[:5] + np.array(VALUE[:5]), atol=1e-6)
 
 
+def test_a_cut_in_the_middle_of_a_row_lends_only_its_bootstrap_value() -> None:
+    # Discount 0.5, lambda 0.5; the episode is cut at step 1, another fills steps 2 and 3 and is cut, too.
+    no = jnp.zeros((1, 4), bool)
+    reward, value = jnp.asarray([[1.0, 2.0, 3.0, 4.0]]), jnp.asarray([[0.0, 1.0, 10.0, 20.0]])
+    truncated, bootstrap = jnp.asarray([[False, True, False, True]]), jnp.asarray([[9.0, 8.0, 9.0, 6.0]])
+    arguments = reward, value, no, truncated, bootstrap, ~no, 0.5, 0.5
+    # Deltas: 1 + 0.5 * 1, 2 + 0.5 * 8 - 1, 3 + 0.5 * 20 - 10, 4 + 0.5 * 6 - 20; decay 0.25 at steps 0 and 2 alone.
+    advantage, target = returns.advantage_and_target(*arguments)
+    np.testing.assert_allclose(advantage, [[1.5 + 0.25 * 5.0, 5.0, 3.0 - 0.25 * 13.0, -13.0]], atol=1e-6)
+    np.testing.assert_allclose(target, [[2.75, 6.0, 9.75, 7.0]], atol=1e-6)
+    # R3 = 4 + 0.5 * 6, R2 = 3 + 0.5 * R3, R1 = 2 + 0.5 * 8, R0 = 1 + 0.5 * R1.
+    _, target = returns.advantage_and_target(*arguments, setting="return")
+    np.testing.assert_allclose(target, [[4.0, 6.0, 6.5, 7.0]], atol=1e-6)
+
+
 def test_masked_step_in_the_middle_cuts_the_recursion() -> None:
     ones = jnp.ones((1, 3))
     no = jnp.zeros((1, 3), bool)

@@ -91,6 +91,13 @@ def test_a_run_exports_the_policy_that_it_evaluates_and_another_starts_from_it(t
     np.testing.assert_allclose(record["ratio_first"], 1.0, atol=1e-4)
 
 
+def test_a_policy_file_is_named_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "policy.txt"
+    assert export.main(["--run-dir", str(tmp_path), "--out", str(out)]) == 2
+    assert capsys.readouterr().err == f"error: --out: got {out}; expected a name that ends in .npz\n"
+    assert not out.exists()
+
+
 def test_a_learner_given_a_policy_acts_as_it_does() -> None:
     config = shipped("cassie_stairs")
     task = make_task(config)

@@ -167,6 +167,25 @@ def test_decoupling_needs_workers_of_its_own(backend):
         check(from_dict({"schedule": "decoupled", "backend": backend}))
 
 
+def test_the_linear_rate_counts_all_that_was_collected(run):
+    """Steps that were dropped as stale count too, or the rate would not reach zero."""
+    shares, update = [], compiled("decoupled")
+
+    def recorded(learner, trajectory, replayed, progress):
+        shares.append(progress)
+        time.sleep(0.2)  # workers fill both of their slots meanwhile, and one of them gets too old
+        return update(learner, trajectory, replayed, progress)
+
+    total = 12 * STEPS
+    changes = {"schedule": "decoupled", "total_env_steps": total, "decoupled": {"max_lag": 0}}
+    status, records = run(changes, make_update=lambda *_: recorded)
+    assert status == 0
+    assert sum(record["dropped_stale"] for record in records) > 0
+    collected = [0, *(record["env_steps"] for record in records)]
+    np.testing.assert_allclose(shares, np.array(collected[:-1]) / total)
+    assert collected[-1] >= total
+
+
 def lose(number: signal.Signals, count: int) -> Hook:
     """Sends a signal to workers after iteration 3; once as many were replaced, stops after another three iterations."""
     last = [10**9]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.files import load_yaml, recipe
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.policy.loading import load_policy_parameters
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
@@ -121,6 +123,42 @@ def test_a_resumed_run_gives_the_same_numbers(tmp_path, tiny):
     assert len(untimed(whole)) == 4
     # The first half's last iteration is evaluated because it is the last; the evaluation changes nothing.
     assert untimed(halves) == untimed(whole)
+
+
+# Everything of the walking task that a resumed run could forget: robots of their own, pushes, stages, a falling rate.
+WALKING = """
+task: cassie
+network: {hidden_size: 8, symmetric: true}
+collect: {num_workers: 2, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 25}
+ppo: {epochs: 1, minibatch_trajectories: 8, learning_rate_schedule: linear}
+cassie:
+  command: {resample_s: [0.1, 0.3], start_moving: 0.5}
+  push: {force_n: [50, 150], interval_s: [0.1, 0.3]}
+  randomize: {share: 0.7}
+stages:
+  - {at_env_steps: 256, set: {cassie.command.forward_m_s: [1, 2]}}
+  - {at_env_steps: 384, set: {cassie.push.force_n: [100, 300]}}
+evaluate: {every_iterations: 3, episodes: 2}
+checkpoint: {every_iterations: 1, keep: 9}
+total_env_steps: 640
+"""
+
+
+def test_a_walking_run_goes_on_bit_for_bit(tmp_path):
+    file, whole, broken = (tmp_path / name for name in ("walking.yaml", "whole", "broken"))
+    file.write_text(WALKING)
+    assert train_main(["--config", str(file), "--run-dir", str(whole)]) == 0
+    shutil.copytree(whole, broken)
+    for iteration in (3, 4, 5):  # as if it had been killed in the first iteration of the first stage
+        shutil.rmtree(broken / "checkpoints" / f"{iteration:09d}")
+    assert train_main(["--resume", str(broken)]) == 0
+    seen = untimed(whole)
+    assert untimed(broken) == seen
+    assert [record["stage"] for record in seen] == [0, 0, 1, 2, 2]
+    np.testing.assert_allclose([record["learning_rate"] / 3e-4 for record in seen], [1, 0.8, 0.6, 0.4, 0.2], rtol=1e-6)
+    ours, theirs = (load_policy_parameters(run, None)[1] for run in (whole, broken))
+    for name, array in ours.items():
+        np.testing.assert_array_equal(array, theirs[name], err_msg=name)
 
 
 def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
