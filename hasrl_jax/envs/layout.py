@@ -22,6 +22,8 @@ class Entry(NamedTuple):
     legs: bool = False  # the numbers are those of the left leg, then those of the right: a mirror swaps the halves
     mean: float = 0.0  # where a policy that never saw the quantity is given it: roughly its mean
     std: float = 1.0  # and its standard deviation
+    parts: tuple[str, ...] = ()  # name of each number, where there are several
+    note: str = ""  # where and how it is measured
 
     @property
     def size(self) -> int:

@@ -6,7 +6,7 @@ the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, w
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,6 +89,8 @@ class Task:
     # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
     with_push: Callable[[Any, Array, Any], Any] | None = None
     push_s: float = 0.0
+    # what who plays a policy without this package must know besides, by name, ready for JSON
+    player_constants: dict[str, Any] = field(default_factory=dict)
 
     @property
     def observation_size(self) -> int:

@@ -3,6 +3,7 @@
 Source: paper section II.A to II.D; constants of the published implementation.
 """
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout
 from hasrl_jax.envs.cassie import clock, commands, randomize, rewards, terrain
-from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, CassieIds, cassie_ids
+from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.envs.draws import between
 from hasrl_jax.envs.layout import AXIAL, NEGATED, QUATERNION, SAME, VECTOR, Entry
@@ -25,20 +26,34 @@ ASSET = Path(__file__).parent / "cassie.xml"
 # Of both legs, left leg first; a mirror changes the sign of what rolls and yaws.
 _MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS) * 2
 _PASSIVE_SIGNS = SAME * (2 * len(PASSIVE_JOINTS))
+_MOTOR_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in MOTORS)
+_PASSIVE_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in PASSIVE_JOINTS)
+_AXES = ("x", "y", "z")
+_ALONG = "along the axes of the world; in the heading frame along and across the heading to keep"
+_IN_PELVIS = "in the frame of the pelvis"
 # What the policy sees, followed by the commands. Source: order of the published implementation, paper section II.A.
 OBSERVATION = (
-    Entry("pelvis_height", "m", SAME),  # above the ground
-    Entry("pelvis_orientation", "", QUATERNION),  # w, x, y, z; in the heading frame relative to the heading to keep
-    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True),
-    Entry("pelvis_velocity", "m/s", VECTOR),  # along the axes of the world, or along the heading to keep
-    Entry("pelvis_angular_velocity", "rad/s", AXIAL),  # pelvis frame
-    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True),
-    Entry("pelvis_acceleration", "m/s^2", VECTOR),  # pelvis frame, gravity removed
-    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True),
-    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True),
-    Entry("clock", "", 2 * NEGATED),  # sin and cos of the phase: half a cycle swaps the feet's clocks
+    Entry("pelvis_height", "m", SAME, note="above the ground"),
+    Entry(
+        "pelvis_orientation",
+        "",
+        QUATERNION,
+        parts=("w", *_AXES),
+        note="quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
+    ),
+    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES),
+    Entry("pelvis_velocity", "m/s", VECTOR, parts=_AXES, note=_ALONG),
+    Entry("pelvis_angular_velocity", "rad/s", AXIAL, parts=_AXES, note=_IN_PELVIS),
+    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES),
+    Entry("pelvis_acceleration", "m/s^2", VECTOR, parts=_AXES, note=f"at the IMU, {_IN_PELVIS}, gravity removed"),
+    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True, parts=_PASSIVE_NAMES),
+    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True, parts=_PASSIVE_NAMES),
+    # Half a cycle swaps the feet's clocks.
+    Entry("clock", "", 2 * NEGATED, parts=("sin", "cos"), note="of 2 pi times the gait phase; zeros while it rests"),
 )
-ACTION = (Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True),)  # relative to NEUTRAL_RAD
+ACTION = (
+    Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
+)
 ACTION_SIZE = layout.size(ACTION)
 NUM_ENCODERS = len(_MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # PD targets at zero action: the motor positions of the initial pose, rad. Source: published implementation,
@@ -128,6 +143,7 @@ def make(config: Config) -> Task:
         with_command=partial(with_command, config.settings),
         with_push=with_push,
         push_s=config.settings.push.duration_s,
+        player_constants=player_constants(config.settings),
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )
@@ -136,6 +152,20 @@ def make(config: Config) -> Task:
 def observation_entries(config: CassieConfig) -> tuple[Entry, ...]:
     """All that the policy sees, in order."""
     return (*OBSERVATION, *(command.entry for command in commands.COMMANDS[config.command.frame]))
+
+
+def player_constants(config: CassieConfig) -> dict[str, Any]:
+    """What who plays a policy elsewhere must know besides the observations and actions; see docs/deploy.md."""
+    clock_fields = ["cycle_s", "cycle_per_speed_s", "quicken_above_m_s"]
+    in_heading = config.command.frame == "heading"
+    return {
+        "command_frame": config.command.frame,
+        "neutral_rad": NEUTRAL_RAD.tolist(),
+        "gravity_m_s2": GRAVITY_M_S2,
+        "clock": {name: getattr(config.clock, name) for name in clock_fields + ["stand_below_m_s"] * in_heading},
+        **({"heading": {"max_heading_error_rad": config.command.max_heading_error_rad}} if in_heading else {}),
+        "fall": dataclasses.asdict(config.termination),
+    }
 
 
 def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
