@@ -24,12 +24,14 @@ ARROWS = {
     "learn": {"config"},
     "runs": {"config", "learn"},
     "policy": {"config", "envs", "learn", "runs"},
+    "deploy": {"config", "envs", "learn", "runs", "policy"},
     "collect": {"config", "envs", "policy"},
     "evaluate": {"config", "envs", "policy", "runs"},
     "train": {"config", "envs", "learn", "runs", "policy", "collect", "evaluate"},
     "visualize": {"config", "envs", "runs", "policy", "evaluate"},
     "bench": {"config", "envs", "learn", "runs", "policy", "collect", "evaluate", "train"},
-    "cli": {"config", "envs", "learn", "runs", "policy", "collect", "evaluate", "train", "visualize", "bench"},
+    "cli": {"config", "envs", "learn", "runs", "policy", "deploy", "collect"}
+    | {"evaluate", "train", "visualize", "bench"},
 }
 # What a worker process must not pay for.
 HEAVY = ("jax", "jaxlib", "flax", "optax", "orbax", "scipy", "matplotlib", "mediapy", "tyro", "rich")

@@ -14,7 +14,7 @@ PROGRAMS = {
     "evaluate": ("hasrl_jax.cli.evaluate", "play a policy and measure it; a whole scorecard with --scorecard"),
     "render": ("hasrl_jax.cli.render", "film a policy"),
     "viewer": ("hasrl_jax.cli.viewer", "watch and steer a policy in the browser or in MuJoCo's window"),
-    "export": ("hasrl_jax.cli.export", "write the policy of a run to one file"),
+    "export": ("hasrl_jax.cli.export", "write a policy to one file: NumPy arrays, ONNX or StableHLO"),
     "figures": ("hasrl_jax.cli.figures", "curves of runs: learning curve, the paper's figures 3 and 4"),
     "pictures": ("hasrl_jax.cli.pictures", "how a policy walks: contacts, reward terms"),
     "bench": ("hasrl_jax.cli.bench", "timed figures: collector, learner, scaling, peers, parity"),

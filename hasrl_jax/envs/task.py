@@ -6,7 +6,7 @@ the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, w
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,6 +91,8 @@ class Task:
     delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
     with_push: Callable[[Any, Array, Any], Any] | None = None
     push_s: float = 0.0
+    # what who plays a policy without this package must know besides, by name, ready for JSON
+    player_constants: dict[str, Any] = field(default_factory=dict)
 
     @property
     def observation_size(self) -> int:

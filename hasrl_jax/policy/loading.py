@@ -151,6 +151,22 @@ def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]
     return learner._replace(policy_params=group("policy/"), value_params=group("value/"), normalizer=normalizer)
 
 
+def training_digest_of(policy: str | Path | None) -> str | None:
+    """What a policy file says of the training that it came from (`training_sha256`); None where nothing does.
+
+    Args:
+      policy: as in `load_policy_parameters`.
+
+    Raises:
+      CheckpointError: the file is missing or damaged.
+    """
+    if policy is None:
+        return None
+    _, metadata = checkpoint.load_policy(RELEASED.get(str(policy), Path(policy)))
+    found = metadata.get("training_sha256")
+    return found if isinstance(found, str) else None
+
+
 def policy_metadata(config: Config) -> dict[str, object]:
     """What a released policy file must carry besides its parameters."""
     return {"config": to_dict(config)}

@@ -18,8 +18,8 @@ from hasrl_jax.envs.task import Reading, Reset, Task, Transition
 from hasrl_jax.types import Array
 
 ASSET = Path(__file__).parent / "cartpole.xml"
-OBSERVATION = (Entry("cart_position", "m", NEGATED), Entry("pole_angle", "rad", NEGATED))
-ACTION = (Entry("push", "", NEGATED),)  # as a share of its limit
+OBSERVATION = (Entry("cart_position", "m", NEGATED), Entry("pole_angle", "0.1 rad", NEGATED))
+ACTION = (Entry("push", "", NEGATED, note="as a share of its limit"),)
 MAX_ANGLE_RAD = 0.2
 MAX_POSITION_M = 1.0
 START = 0.05  # half width of the uniform start position (m), angle (rad) and of their rates

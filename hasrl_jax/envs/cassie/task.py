@@ -3,6 +3,7 @@
 Source: paper section II.A to II.D; constants of the published implementation.
 """
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,22 +26,42 @@ ASSET = Path(__file__).parent / "cassie.xml"
 # Of both legs, left leg first; a mirror changes the sign of what rolls and yaws.
 _MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS) * 2
 _PASSIVE_SIGNS = SAME * (2 * len(PASSIVE_JOINTS))
+_MOTOR_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in MOTORS)
+_PASSIVE_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in PASSIVE_JOINTS)
+_AXES = ("x", "y", "z")
+_ALONG = "along the axes of the world; in the heading frame along and across the heading to keep"
+_IN_PELVIS = "in the frame of the pelvis"
 # What the policy sees, followed by the commands. Source: order of the published implementation, paper section II.A.
 OBSERVATION = (
-    Entry("pelvis_height", "m", SAME, noise=0.02),  # above the ground
+    Entry("pelvis_height", "m", SAME, noise=0.02, note="above the ground"),
     Entry(
-        "pelvis_orientation", "", QUATERNION, noise=0.01
-    ),  # w, x, y, z; in the heading frame relative to the heading to keep
-    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, noise=0.01),
-    Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1),  # along the axes of the world, or along the heading to keep
-    Entry("pelvis_angular_velocity", "rad/s", AXIAL, noise=0.2),  # pelvis frame
-    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, noise=0.5),
-    Entry("pelvis_acceleration", "m/s^2", VECTOR, noise=1.0),  # pelvis frame, gravity removed
-    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True, noise=0.01),
-    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True, noise=0.5),
-    Entry("clock", "", 2 * NEGATED),  # sin and cos of the phase: half a cycle swaps the feet's clocks
+        "pelvis_orientation",
+        "",
+        QUATERNION,
+        noise=0.01,
+        parts=("w", *_AXES),
+        note="quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
+    ),
+    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, noise=0.01, parts=_MOTOR_NAMES),
+    Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1, parts=_AXES, note=_ALONG),
+    Entry("pelvis_angular_velocity", "rad/s", AXIAL, noise=0.2, parts=_AXES, note=_IN_PELVIS),
+    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, noise=0.5, parts=_MOTOR_NAMES),
+    Entry(
+        "pelvis_acceleration",
+        "m/s^2",
+        VECTOR,
+        noise=1.0,
+        parts=_AXES,
+        note=f"at the IMU, {_IN_PELVIS}, gravity removed",
+    ),
+    Entry("passive_positions", "rad", _PASSIVE_SIGNS, legs=True, noise=0.01, parts=_PASSIVE_NAMES),
+    Entry("passive_velocities", "rad/s", _PASSIVE_SIGNS, legs=True, noise=0.5, parts=_PASSIVE_NAMES),
+    # Half a cycle swaps the feet's clocks.
+    Entry("clock", "", 2 * NEGATED, parts=("sin", "cos"), note="of 2 pi times the gait phase; zeros while it rests"),
 )
-ACTION = (Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True),)  # relative to NEUTRAL_RAD
+ACTION = (
+    Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
+)
 ACTION_SIZE = layout.size(ACTION)
 # No-load speed of each motor over the ratio of its gear: the joint's speed at which it gives no torque, rad/s.
 # Source: `user` and `gear` of the actuators in Oregon State University's cassie.xml (revolutions per minute).
@@ -145,6 +166,7 @@ def make(config: Config) -> Task:
         with_command=partial(with_command, config.settings),
         with_push=with_push,
         push_s=config.settings.push.duration_s,
+        player_constants=player_constants(config.settings),
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )
@@ -159,6 +181,20 @@ def noise_size(config: CassieConfig) -> int:
     """Uniform numbers that the noise of one observation consumes."""
     noisy = config.randomize.enabled and config.randomize.observation_noise > 0
     return layout.size(observation_entries(config)) if noisy else 0
+
+
+def player_constants(config: CassieConfig) -> dict[str, Any]:
+    """What who plays a policy elsewhere must know besides the observations and actions; see docs/deploy.md."""
+    clock_fields = ["cycle_s", "cycle_per_speed_s", "quicken_above_m_s"]
+    in_heading = config.command.frame == "heading"
+    return {
+        "command_frame": config.command.frame,
+        "neutral_rad": NEUTRAL_RAD.tolist(),
+        "gravity_m_s2": GRAVITY_M_S2,
+        "clock": {name: getattr(config.clock, name) for name in clock_fields + ["stand_below_m_s"] * in_heading},
+        **({"heading": {"max_heading_error_rad": config.command.max_heading_error_rad}} if in_heading else {}),
+        "fall": dataclasses.asdict(config.termination),
+    }
 
 
 def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
