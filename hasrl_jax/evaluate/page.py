@@ -40,12 +40,22 @@ SURVIVAL: tuple[Column, ...] = (
     ("lateral error, m/s", "lateral_speed_error", number(3)),
     ("heading drift, °", "heading_drift_deg", number(0)),
 )
+STEERING: tuple[Column, ...] = (
+    *SURVIVAL[:3],
+    SURVIVAL[5],
+    SURVIVAL[6],
+    ("yaw rate, rad/s", "yaw_rate", number(2)),
+    ("yaw rate error, rad/s", "yaw_rate_error", number(3)),
+    ("height, m", "height", number(2)),
+    ("height error, m", "height_error", number(3)),
+)
 GAIT: tuple[Column, ...] = (
     ("steps per second", "step_frequency_hz", number(2)),
     ("duty factor", "duty_factor", number(2)),
     ("difference of the feet", "duty_asymmetry", number(3)),
     ("right foot in the left's cycle", "phase_offset", number(2)),
     ("cost of transport", "cost_of_transport", number(2)),
+    ("motor power, W", "motor_power", number(0)),
 )
 SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
 
@@ -72,6 +82,8 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
     (policy, rows), *others = report["policies"].items()
     cap_s = report["seconds"]
     survival = ("speed", "lateral", "changing")
+    steering = ("steering", "turn", "sidestep", "height")
+    steered = select(rows, *steering) + select(rows, *steering, randomized=True)
     sections = (
         ("The nominal robot", "", table(select(rows, *survival), SURVIVAL)),
         ("Dynamics randomisation, the paper's ranges", "", table(select(rows, *survival, randomized=True), SURVIVAL)),
@@ -88,12 +100,24 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
             "7 s after the start; survived when the robot is up 5 s later.\n",
             push_table(select(rows, "push")),
         ),
+        (
+            "Disturbances",
+            "One at a time, the robot nominal in all else; no policy was trained for all of them.\n",
+            table(select(rows, "disturbance"), SURVIVAL),
+        ),
+        (
+            "Steering",
+            "Commands of all dimensions change together every 2 to 6 s, or one is held. The rows of changing commands "
+            "come first with the nominal robot; the last ones are randomised.\n",
+            table(steered, STEERING),
+        ),
     )
     parts = [
         f"# Scorecard: {policy}\n",
         f"C MuJoCo at {report['physics_hz']:.0f} Hz, mean action, {report['episodes']} episodes a row, seed "
         f"{report['seed']}, at most {cap_s:g} s each, from rest. A fall is a pelvis below 0.6 m or a tilt above 45°. "
-        "In brackets and after ±: 95 % intervals. A speed error is a time-weighted mean absolute error: that of the "
+        "Motors have a torque-speed curve. In brackets and after ±: 95 % intervals.\n",
+        "A speed error is a time-weighted mean absolute error: that of the "
         "mean speed under a command, from 3 s after it was given, averaged over the commands by the time under each.\n",
         f"`{report['command']}`\n",
         "![Share that stays up, speed, pushes and gait](scorecard.png)\n",

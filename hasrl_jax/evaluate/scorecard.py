@@ -19,7 +19,7 @@ import numpy as np
 
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
-from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
@@ -35,6 +35,48 @@ LATERAL_M_S = (-0.1, 0.1)
 LATERAL_AT_M_S = 0.5  # forward speed of the rows with a lateral command
 CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands change
 CHANGE_S = (2.0, 6.0)  # seconds between commands
+TURNS_RAD_S = (-1.0, -0.5, 0.5, 1.0)
+TURN_AT_M_S = (0.0, 1.0)
+SIDESTEPS_M_S = (-0.5, 0.5)
+HEIGHTS_M = (0.65, 0.8, 1.0)
+HEIGHT_AT_M_S = 0.5
+STEERED = {"lateral_m_s": [-0.5, 0.5], "yaw_rate_rad_s": [-1.0, 1.0], "height_m": [0.65, 1.0]}  # of changing commands
+DISTURBED_AT_M_S = 1.0
+# One kind of disturbance at a time; each is met by every episode at its worst or within its range.
+DISTURBANCES: dict[str, dict[str, Any]] = {
+    "control delay 10 ms": {"control_delay_s": [0.01, 0.01]},
+    "control delay 20 ms": {"control_delay_s": [0.02, 0.02]},
+    "noisy observations": {"observation_noise": 1.0},
+    "velocity off by up to 0.2 m/s": {"velocity_bias_m_s": 0.2},
+    "10 kg on the pelvis": {"payload_kg": [10.0, 10.0]},
+    "pelvis 3 kg lighter": {"payload_kg": [-3.0, -3.0]},
+    "center of mass off by up to 5 cm": {"center_of_mass_m": 0.05},
+    "torque limits x 0.8": {"torque_scale": [0.8, 0.8]},
+    "PD gains x 0.8": {"pd_gain_scale": [0.8, 0.8]},
+    "PD gains x 1.2": {"pd_gain_scale": [1.2, 1.2]},
+    "springs x 0.8 to 1.2": {"spring_scale": [0.8, 1.2]},
+    "friction 0.4": {"sliding_friction": [0.4, 0.4]},
+    "friction 0.2": {"sliding_friction": [0.2, 0.2]},
+}
+# Draws that leave the nominal robot as it is.
+NOTHING_DRAWN: dict[str, Any] = {
+    **{key: [1.0, 1.0] for key in ("damping_scale", "mass_scale", "physics_rate_scale", "sliding_friction")},
+    "torsional_friction": [0.005, 0.005],
+    "rolling_friction": [1e-4, 1e-4],
+    "encoder_offset_rad": 0.0,
+    **{key: [1.0, 1.0] for key in ("pd_gain_scale", "torque_scale", "spring_scale")},
+    **{key: [0.0, 0.0] for key in ("payload_kg", "control_delay_s")},
+    **dict.fromkeys(("center_of_mass_m", "velocity_bias_m_s", "observation_noise"), 0.0),
+}
+PAPER_DRAWS = (
+    "damping_scale",
+    "mass_scale",
+    "sliding_friction",
+    "torsional_friction",
+    "rolling_friction",
+    "encoder_offset_rad",
+    "physics_rate_scale",
+)
 PUSHES_N = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
 PUSH_SPEEDS_M_S = (1.0, 0.0)
 # Walk, a random moment within, duration, then survive; the walk is the longest, or a second push would come in time.
@@ -42,31 +84,42 @@ PUSH_AFTER_S, PUSH_PHASE_S, PUSH_S, SURVIVE_S = 6.0, 1.0, 0.2, 5.0
 FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
 # What every row sets itself, of `cassie`.
-SETTINGS = ("command", "push", "terrain", "termination", "randomize.enabled", "randomize.share")
-REVISION = 3  # of what a row plays and what its figures mean; those of an earlier one are measured anew
+SETTINGS = ("command", "motor", "push", "terrain", "termination", "randomize")
+REVISION = 4  # of what a row plays and what its figures mean; those of an earlier one are measured anew
 BATCH = 25  # episodes that one job plays side by side
 
 
 class Row(NamedTuple):
     """One kind of episode."""
 
-    kind: str  # "speed", "lateral", "changing" or "push"
+    kind: str  # "speed", "lateral", "changing", "push", "disturbance", "turn", "sidestep", "height" or "steering"
     forward_m_s: tuple[float, float]
     lateral_m_s: tuple[float, float] = (0.0, 0.0)
     randomized: bool = False
     push_n: float = 0.0
+    disturbance: str = ""  # one of `DISTURBANCES`
+    yaw_rate_rad_s: float = 0.0  # heading frame
+    height_m: float = 0.0  # heading frame; 0 is the usual one
 
     @property
     def title(self) -> str:
         low, high = self.forward_m_s
         speed = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s, changing"
-        if self.kind == "lateral":
+        if self.kind == "steering":
+            speed += ", turning, sideways and in height too"
+        if self.kind in ("lateral", "sidestep"):
             speed += f", {self.lateral_m_s[0]:+g} m/s to the left"
+        if self.kind == "turn":
+            speed += f", {self.yaw_rate_rad_s:+g} rad/s to the left"
+        if self.height_m:
+            speed += f", {self.height_m:g} m high"
+        if self.disturbance:
+            speed += f", {self.disturbance}"
         return f"{speed}, {self.push_n:g} N push" if self.push_n else speed
 
 
-def rows() -> list[Row]:
-    """All rows of a scorecard, in the order in which they are measured."""
+def rows(trained: Config) -> list[Row]:
+    """All rows of a scorecard of the policy of `trained`, in the order in which they are measured."""
     lateral = (LATERAL_AT_M_S, LATERAL_AT_M_S)
     return [
         *(Row("speed", (v, v)) for v in SPEEDS_M_S),
@@ -74,6 +127,19 @@ def rows() -> list[Row]:
         *(Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N),
         *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
         *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
+        *(Row("disturbance", (DISTURBED_AT_M_S,) * 2, disturbance=name) for name in DISTURBANCES),
+        *(_steered_rows() if trained.settings.command.frame == "heading" else ()),
+    ]
+
+
+def _steered_rows() -> list[Row]:
+    """What only a policy that is commanded in the heading frame can be told."""
+    still = (0.0, 0.0)
+    return [
+        *(Row("steering", limits, randomized=drawn) for limits in CHANGING_M_S for drawn in (False, True)),
+        *(Row("turn", (v, v), yaw_rate_rad_s=rate) for v in TURN_AT_M_S for rate in TURNS_RAD_S),
+        *(Row("sidestep", still, (v, v)) for v in SIDESTEPS_M_S),
+        *(Row("height", (HEIGHT_AT_M_S,) * 2, height_m=height) for height in HEIGHTS_M),
     ]
 
 
@@ -84,21 +150,35 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
     """
     if row.kind == "push":
         seconds = PUSH_AFTER_S + PUSH_PHASE_S + PUSH_S + SURVIVE_S
-    elif row.kind == "lateral":
+    elif row.kind not in ("speed", "changing", "steering"):
         seconds = min(seconds, SHORT_S)
+    height = row.height_m or trained.settings.reward.height_m
+    told: dict[str, Any] = {
+        "lateral_m_s": list(row.lateral_m_s),
+        "yaw_rate_rad_s": [row.yaw_rate_rad_s] * 2,
+        "height_m": [height, height],
+    }
+    drawn = NOTHING_DRAWN
+    if row.randomized:
+        drawn = NOTHING_DRAWN | {name: getattr(RandomizeConfig(), name) for name in PAPER_DRAWS}
+    changing = row.kind in ("changing", "steering")
     cassie = {
         "command": {
             "forward_m_s": list(row.forward_m_s),
-            "lateral_m_s": list(row.lateral_m_s),
-            # In the heading frame: straight ahead, at the usual height.
-            "yaw_rate_rad_s": [0.0, 0.0],
-            "height_m": [trained.settings.reward.height_m] * 2,
+            **(told if row.kind != "steering" else STEERED | {"turn_m_s2": 2.0, "height_fade_m_s": [1.5, 3.0]}),
+            "height_probability": 1.0,
             "start_heading_rad": 0.0,
             **dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0),
             "start_moving": 0.0,
-            "resample_s": list(CHANGE_S) if row.kind == "changing" else [0.0, 0.0],
+            "resample_s": list(CHANGE_S) if changing else [0.0, 0.0],
         },
-        "randomize": {"enabled": row.randomized, "share": 1.0},
+        "motor": {"torque_speed_curve": True},
+        "randomize": {
+            "enabled": row.randomized or bool(row.disturbance),
+            "share": 1.0,
+            **drawn,
+            **DISTURBANCES.get(row.disturbance, {}),
+        },
         "push": {
             "force_n": [row.push_n, row.push_n],
             "interval_s": [PUSH_AFTER_S, PUSH_AFTER_S + PUSH_PHASE_S],
@@ -188,7 +268,7 @@ def refuse_settings(arguments: list[str]) -> None:
 
 def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
     """Tells policies apart, and what they are played under."""
-    played = [to_dict(row_config(config, row, seconds)) for row in rows()]
+    played = [to_dict(row_config(config, row, seconds)) for row in rows(config)]
     digest = hashlib.sha256(json.dumps([REVISION, played], sort_keys=True).encode())
     for name in sorted(parameters):
         digest.update(name.encode() + parameters[name].tobytes())
@@ -210,7 +290,7 @@ def measure(
     """
     jobs = [
         (row, row_config(trained, row, seconds), parameters, min(BATCH, episodes - done), [seed, number, done])
-        for number, row in enumerate(rows())
+        for number, row in enumerate(rows(trained))
         if number >= skip
         for done in range(0, episodes, BATCH)
     ]
@@ -248,7 +328,8 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.n
         "seconds": played.seconds,
         "reached_cap": played.reached_cap,
         "diverged": played.diverged,
-        **{name: speeds[name] for name in ("forward_speed", "forward_speed_error", "lateral_speed_error")},
+        **{name: values for name, values in speeds.items() if not name.endswith(("_command", "_instantaneous"))},
+        "motor_power": np.nanmean(column["motor_power"], axis=0),
         "heading_drift_deg": np.abs(np.rad2deg(heading)),
         **figures,
     }

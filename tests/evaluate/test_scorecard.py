@@ -17,12 +17,48 @@ from hasrl_jax.policy.loading import load_baseline
 
 
 def test_rows_cover_what_is_asked() -> None:
-    rows = scorecard.rows()
+    rows = scorecard.rows(from_dict({}))
     assert len({(row.title, row.randomized) for row in rows}) == len(rows)
     for randomized in (False, True):
         speeds = {row.forward_m_s[0] for row in rows if row.kind == "speed" and row.randomized == randomized}
         assert speeds == {-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0}
     assert {row.push_n for row in rows if row.kind == "push"} == {50, 100, 150, 200, 250, 300}
+    steered = scorecard.rows(shipped("cassie_steer"))
+    assert steered[: len(rows)] == rows
+    assert {row.kind for row in steered[len(rows) :]} == {"steering", "turn", "sidestep", "height"}
+
+
+def test_a_disturbance_is_the_only_one() -> None:
+    """The robot that a row of one disturbance draws differs from the nominal one in nothing else."""
+    trained = shipped("cassie_steer")
+    nominal = scorecard.make_task(scorecard.row_config(trained, Row("speed", (1.0, 1.0)), 20.0)).model
+    changed = {
+        "10 kg on the pelvis": {"body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0"},
+        "torque limits x 0.8": {"actuator_forcerange"},
+        "PD gains x 1.2": {"actuator_gainprm"},
+        "friction 0.4": {"geom_friction"},
+        "control delay 10 ms": set(),
+        "noisy observations": set(),
+    }
+    for name, fields in changed.items():
+        task = scorecard.make_task(
+            scorecard.row_config(trained, Row("disturbance", (1.0, 1.0), disturbance=name), 20.0)
+        )
+        drawn = task.reset(np.random.default_rng(0).random((2, task.reset_uniforms)), np).model_fields
+        drawn.pop("timestep")
+        differ = {
+            field for field, values in drawn.items() if not np.allclose(values, getattr(nominal, field), rtol=1e-9)
+        }
+        assert differ == fields, name
+
+
+def test_a_row_of_steering_commands_all_dimensions() -> None:
+    trained = shipped("cassie_steer")
+    config = scorecard.row_config(trained, Row("steering", (-0.3, 4.0)), 60.0)
+    task = scorecard.make_task(config)
+    assert [command.drawn for command in task.commands] == [(-0.3, 4.0), (-0.5, 0.5), (-1.0, 1.0), (0.65, 1.0)]
+    turn = scorecard.row_config(trained, Row("turn", (1.0, 1.0), yaw_rate_rad_s=-0.5), 60.0)
+    assert [command.drawn for command in scorecard.make_task(turn).commands][2:] == [(-0.5, -0.5), (0.9, 0.9)]
 
 
 def test_a_row_sets_the_task_and_keeps_the_policy_s_own_clock() -> None:
@@ -82,7 +118,7 @@ def test_a_zero_policy_never_acts() -> None:
 def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = [Row("speed", (0.0, 0.0)), Row("speed", (1.0, 1.0)), Row("push", (1.0, 1.0), push_n=50.0)]
     few += [Row("speed", (0.0, 0.0), randomized=True)]
-    monkeypatch.setattr(scorecard, "rows", lambda: few)
+    monkeypatch.setattr(scorecard, "rows", lambda _: few)
     monkeypatch.setattr(scorecard, "BATCH", 2)
     arguments = ["--policy", "released", "--scorecard", str(tmp_path), "--episodes", "3", "--seconds", "4"]
     assert evaluate_main([*arguments, "--physics", "training", "--against", "zero"]) == 0
