@@ -24,4 +24,4 @@ bench:  ## timed figures on an idle machine, and the tables of docs/ from them
 
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv
-	$(BIN)/uv pip compile --universal --python-version 3.11 --extra dev --extra ray --extra viewer --no-header --no-annotate pyproject.toml -o requirements.lock
+	$(BIN)/uv pip compile --universal --python-version 3.11 --extra dev --extra mutation --extra ray --extra viewer --no-header --no-annotate pyproject.toml -o requirements.lock
