@@ -12,6 +12,7 @@ from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize.viewer import browser, native
+from hasrl_jax.visualize.viewer.guard import is_loopback
 from hasrl_jax.visualize.viewer.live import Live, Pace
 
 
@@ -33,15 +34,16 @@ def view(arguments: list[str], opened: Callable[[str], object] | None = None) ->
         native.require_display()
     else:
         browser.require_viser()
-        browser.free_port(known.port)
+        browser.free_port(known.port, known.host)
     config, parameters = policy_to_play(known, rest, "viewer")
     live = Live(config, parameters, known.seed, known.randomized)
     if known.native:
         native.show(live, known.randomized)
         return
-    page = browser.Browser(live, known.port, known.randomized)
+    page = browser.Browser(live, known.port, known.randomized, known.host)
     try:
-        print(f"open {page.url} (this machine only); Ctrl-C ends the viewer", flush=True)
+        whose = "this machine only" if is_loopback(known.host) else "whoever has this address; it is not encrypted"
+        print(f"open {page.url} ({whose}); Ctrl-C ends the viewer", flush=True)
         if opened:
             opened(page.url)
         loop(live, page, Pace(), lambda: False)
@@ -68,7 +70,9 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     )
     add_policy_options(parser)
     parser.add_argument("--randomized", action="store_true", help="begin with a randomised robot")
-    parser.add_argument("--port", type=int, default=8080, help="of the page on 127.0.0.1; 0 takes a free one")
+    parser.add_argument("--port", type=int, default=8080, help="of the page; 0 takes a free one")
+    hosts = f"address to listen on; {browser.ANY_HOST}: all of this machine, for those who have the token"
+    parser.add_argument("--host", default=browser.HOST, help=hosts)
     parser.add_argument("--native", action="store_true", help="MuJoCo's own window instead of the browser")
     return parser.parse_known_args(arguments)
 

@@ -1,6 +1,7 @@
 """Loads the parameters that a policy acts with, from a run directory or from a released policy file."""
 
 import dataclasses
+import hashlib
 from pathlib import Path
 
 import jax
@@ -27,6 +28,12 @@ RELEASED = {
     "released-steer": _FOLDER / "cassie_steer.npz",
     "released-stairs": _FOLDER / "cassie_stairs.npz",
 }
+# Of the files; a digest inside a file finds damage, and this one a file that was put in its place.
+RELEASED_SHA256 = {
+    "released": "a848c5a08b333bcc5d869a874a3b3bdbe69af6a580e4a3739e6c992f393d575f",
+    "released-steer": "c94f3aab97b1812a253b5bc1ee441bde4f83ddaec3674bfd9d8e1dd4f631bedc",
+    "released-stairs": "a3c2a6994789537a3cf7b25fb903cdae07ff3e1bac6045af2fb8ea5631c23ce6",
+}
 
 
 def load_policy_parameters(
@@ -51,6 +58,8 @@ def load_policy_parameters(
     path = RELEASED.get(str(source), Path(source))
     if not path.exists():
         raise CheckpointError(f"{path}: there is no such file; expected a policy file, or one of {', '.join(RELEASED)}")
+    if str(source) in RELEASED_SHA256:
+        _require_released(path, RELEASED_SHA256[str(source)])
     return _from_file(path)
 
 
@@ -185,6 +194,23 @@ def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
     return config, ppo.export_parameters(loaded.learner, config.network.normalize_observations)
 
 
+def _require_released(path: Path, expected: str) -> None:
+    """Refuses a file that is not the one that was released.
+
+    Raises:
+      CheckpointError: it is another, or cannot be read.
+    """
+    try:
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+    if found != expected:
+        raise CheckpointError(
+            f"{path}: not the policy of this release: its SHA-256 is {found[:12]}…, expected {expected[:12]}…; install "
+            "the package again, or name the file itself to play it"
+        )
+
+
 def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
     parameters, metadata = checkpoint.load_policy(path)
     try:
@@ -198,4 +224,10 @@ def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
         found = parameters[name].shape if name in parameters else "missing"
         if found != shape:
             raise CheckpointError(f"{path}: parameter {name} is {found}; its configuration asks for {shape}")
+        if parameters[name].dtype != np.float32:
+            raise CheckpointError(f"{path}: parameter {name} is of type {parameters[name].dtype}; expected float32")
+        if not np.isfinite(parameters[name]).all():
+            raise CheckpointError(f"{path}: parameter {name} holds numbers that are not finite")
+    if (parameters.get("normalizer/std", np.ones(1)) <= 0).any():
+        raise CheckpointError(f"{path}: parameter normalizer/std holds numbers that are not positive")
     return config, {name: parameters[name] for name in wanted}

@@ -10,13 +10,15 @@ import errno
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +39,7 @@ _SET_ASIDE = ".damaged"  # ends the name of a step that was found damaged
 _PASSING = (errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE)
 _FILES_DIGEST = "files.sha256"
 _POLICY_METADATA, _POLICY_DIGEST = "__metadata__", "__sha256__"
+LARGEST_POLICY = 2**30  # bytes of a policy file once unpacked; the released ones have 0.3 MB
 
 Signature = dict[str, tuple[str, tuple[int, ...]]]  # name -> (dtype, shape)
 
@@ -168,11 +171,13 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `save_policy` wrote: (parameters, metadata).
 
     Raises:
-      CheckpointError: missing, not a policy file, or damaged.
+      CheckpointError: missing, not a policy file, damaged, or larger than LARGEST_POLICY.
     """
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = dict(archive)
+        with open(path, "rb") as file:
+            _require_moderate_size(file)
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = dict(archive)
         text, digest = arrays.pop(_POLICY_METADATA), arrays.pop(_POLICY_DIGEST)
         if str(digest) != _digest(arrays, {_POLICY_METADATA: text}):
             raise _DamagedError("its contents do not match their SHA-256 digest")
@@ -181,6 +186,30 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise CheckpointError(f"{path}: there is no policy file") from None
     except Exception as error:  # zip and NumPy raise many kinds for damaged files
         raise CheckpointError(f"{path}: not a policy file, or damaged: {_reason(error)}") from error
+
+
+def _require_moderate_size(file: BinaryIO) -> None:
+    """Looks at what a zip file says of itself before anything of it is unpacked, and at what its arrays say.
+
+    Raises:
+      _DamagedError: it would take too much memory.
+    """
+    with zipfile.ZipFile(file) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+        if size <= LARGEST_POLICY:
+            size = sum(_array_size(archive, entry) for entry in archive.infolist())
+    file.seek(0)
+    if size > LARGEST_POLICY:
+        raise _DamagedError(f"it would unpack to {size} bytes; expected at most {LARGEST_POLICY}")
+
+
+def _array_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """Bytes that an array asks for before it is read, whatever follows."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    return math.prod(shape) * dtype.itemsize
 
 
 def _restore(path: Path, step: int, template: LearnerState) -> Loaded:

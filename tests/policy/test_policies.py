@@ -13,7 +13,7 @@ from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.errors import ConfigError
+from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.evaluate import rollout, statistics
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
@@ -162,6 +162,42 @@ def test_a_policy_of_another_shape_is_refused_in_one_line(changes: dict, named: 
 def test_a_resumed_run_takes_no_other_policy(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--init-policy and --resume"):
         parse_train(["--resume", str(tmp_path), "--init-policy", "released"])
+
+
+def _changed(tmp_path: Path, **changes: np.ndarray) -> Path:
+    """A whole policy file, with its digest, in which some arrays are others."""
+    config, parameters = policies.load_policy_parameters(None, None)
+    path = tmp_path / "policy.npz"
+    checkpoint.save_policy(path, parameters | changes, policies.policy_metadata(config))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "complaint"),
+    [
+        ("policy/log_std", np.zeros(11, np.float32), r"is \(11,\); its configuration asks for \(10,\)"),
+        ("policy/log_std", np.zeros(10), "is of type float64; expected float32"),
+        ("policy/log_std", np.full(10, np.nan, np.float32), "holds numbers that are not finite"),
+        ("policy/mean_bias", np.full(10, np.inf, np.float32), "holds numbers that are not finite"),
+        ("policy/mean_bias", np.array(["x"] * 10), "is of type <U1; expected float32"),
+        ("normalizer/std", np.zeros(50, np.float32), "holds numbers that are not positive"),
+    ],
+)
+def test_parameters_are_checked_before_they_act(tmp_path: Path, name: str, array: np.ndarray, complaint: str) -> None:
+    path = _changed(tmp_path, **{name: array})
+    with pytest.raises(CheckpointError, match=rf"^{path}: parameter {name} {complaint}$"):
+        policies.load_policy_parameters(None, path)
+
+
+def test_a_released_policy_that_was_replaced_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is whole by its own digest, and another."""
+    assert policies.RELEASED_SHA256.keys() == policies.RELEASED.keys()
+    other = _changed(tmp_path, **{"policy/log_std": np.zeros(10, np.float32)})
+    monkeypatch.setitem(policies.RELEASED, "released", other)
+    for source in ("released", None):
+        with pytest.raises(CheckpointError, match=rf"^{other}: not the policy of this release: its SHA-256 is \w+…"):
+            policies.load_policy_parameters(None, source)
+    assert not policies.load_policy_parameters(None, other)[1]["policy/log_std"].any()
 
 
 def test_no_source_is_the_released_policy() -> None:

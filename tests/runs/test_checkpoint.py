@@ -1,6 +1,7 @@
 """Checkpoints are exact, whole or refused, and a failed save harms nothing."""
 
 import errno
+import io
 import json
 import logging
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -324,6 +326,23 @@ def test_damaged_policy(tmp_path: Path, learner: LearnerState) -> None:
     arrays: dict[str, Any] = {"policy/a": np.zeros(3), "__sha256__": "0", "__metadata__": json.dumps({})}
     np.savez(path, **arrays)  # a whole archive with another digest
     with pytest.raises(CheckpointError, match="SHA-256"):
+        checkpoint.load_policy(path)
+
+
+def test_a_policy_file_that_would_fill_the_memory_is_not_unpacked(
+    tmp_path: Path, learner: LearnerState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, header = tmp_path / "policy.npz", io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (2**40,)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("policy/log_std.npy", header.getvalue())  # says 4 TiB, and has none of it
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was unpacked"))
+    with pytest.raises(CheckpointError, match=f"it would unpack to {2**42} bytes; expected at most {2**30}"):
+        checkpoint.load_policy(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policy/log_std.npy", bytes(10**6))
+    monkeypatch.setattr(checkpoint, "LARGEST_POLICY", 10**6 - 1)
+    with pytest.raises(CheckpointError, match=f"it would unpack to {10**6} bytes"):
         checkpoint.load_policy(path)
 
 

@@ -1,6 +1,8 @@
 """The viewer: its state under controls, its pace, its shapes, and a page that only this machine can open."""
 
 import sys
+import time
+import urllib.error
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +20,7 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.visualize.viewer import browser, native
+from hasrl_jax.visualize.viewer import browser, guard, native
 from hasrl_jax.visualize.viewer.live import MAX_BEHIND_S, Controls, Live, Pace, Push, readout
 from hasrl_jax.visualize.viewer.shapes import shapes
 
@@ -209,6 +211,97 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
     assert browser.free_port(port) == port  # nothing listens any more
 
 
+def _get(url: str, **headers: str) -> tuple[int, str, dict[str, str]]:
+    """(status, text, headers) of a request."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+            return answer.status, answer.read().decode(), dict(answer.headers)
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode(), dict(error.headers)
+
+
+def _moves_sliders(page: browser.Browser, url: str, **headers: str) -> bool:
+    """Whether a websocket with these headers may set the first slider."""
+    import msgspec
+    import viser
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    page._sliders[0].value = 0.0
+    slider = page._sliders[0]._impl.uuid
+    message = {"type": "GuiUpdateMessage", "uuid": slider, "updates": {"value": 0.75}}
+    try:
+        with connect(
+            url.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"], additional_headers=headers
+        ) as connection:
+            connection.recv(timeout=10)
+            connection.send(msgspec.msgpack.encode(message))
+            ended = time.monotonic() + 5
+            while page._sliders[0].value == 0.0 and time.monotonic() < ended:
+                time.sleep(0.01)
+    except InvalidStatus as refused:
+        return refused.response.status_code != 403
+    return page._sliders[0].value == 0.75
+
+
+def test_no_page_of_another_site_is_answered(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live, port=0)
+    try:
+        port = page.url.rpartition(":")[2]
+        for host in (f"127.0.0.1:{port}", f"localhost:{port}", "LOCALHOST:9", "[::1]:80", "localhost"):
+            assert _get(page.url, Host=host)[0] == 200, host
+        for host in ("evil.example", f"evil.example:{port}", "localhost.evil.example", "", "127.0.0.1.evil.example:80"):
+            status, text, _ = _get(page.url, Host=host)
+            assert (status, text) == (403, "the viewer answers to localhost only\n"), host
+        assert _get(page.url, Origin=page.url)[0] == 200
+        for origin in ("http://evil.example", "null", f"https://127.0.0.1:{port}", "http://127.0.0.1:9", ""):
+            assert _get(page.url, Origin=origin)[0] == 403, origin
+        assert _get(page.url)[2]["X-Frame-Options"] == "DENY"
+        assert _moves_sliders(page, page.url, Origin=page.url)
+        assert not _moves_sliders(page, page.url, Origin="http://evil.example")
+        assert not _moves_sliders(page, page.url, Host="evil.example", Origin="http://evil.example")
+    finally:
+        page.close()
+
+
+def test_beyond_this_machine_a_token_is_asked_for(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live, port=0, host=browser.ANY_HOST)
+    try:
+        address, _, token = page.url.partition("/?token=")
+        assert len(token) == 32
+        here = f"http://127.0.0.1:{address.rpartition(':')[2]}"
+        for query, cookie in (
+            ("", ""),
+            ("/?token=", ""),
+            ("/?token=x", ""),
+            ("", "hasrl_viewer=x"),
+            ("", f"x={token}"),
+        ):
+            assert _get(here + query, Cookie=cookie)[0] == 403
+        status, _, headers = _get(f"{here}/?token={token}")
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert (status, cookie) == (200, f"hasrl_viewer={token}")
+        assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
+        assert _get(here, Cookie=f"a=b; {cookie}", Host="robots.example:80")[0] == 200
+        assert _moves_sliders(page, here, Origin=here, Cookie=cookie)
+        assert not _moves_sliders(page, here, Origin=here)
+        assert not _moves_sliders(page, here, Origin="http://evil.example", Cookie=cookie)
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost", "0.0.0.0", "::", "192.168.1.2", "x"])
+def test_what_only_this_machine_can_reach(host: str) -> None:
+    assert guard.is_loopback(host) == (host.startswith("127.") or host in ("::1", "localhost"))
+
+
+def test_a_server_that_is_not_guarded_is_refused() -> None:
+    with pytest.raises(ConfigError, match="viser"), guard.guarded(None):
+        pass
+
+
 def test_without_viser_one_line_says_what_to_install(
     live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -235,6 +328,7 @@ def test_without_viser_one_line_says_what_to_install(
         (["--seed", "-1"], "--seed"),
         (["--port", "x"], "--port"),
         (["--prt", "1"], "--prt"),
+        (["--host", "no.such.host.invalid"], "no.such.host.invalid"),
     ],
 )
 def test_bad_arguments_are_one_line(

@@ -1,8 +1,9 @@
-"""The viewer's page: a panel of controls, the robot, a floor. Served on this machine only."""
+"""The viewer's page: a panel of controls, the robot, a floor. Served to this machine only, unless told otherwise."""
 
 import contextlib
 import io
 import math
+import secrets
 import socket
 import threading
 from typing import TYPE_CHECKING
@@ -12,13 +13,14 @@ import numpy as np
 
 from hasrl_jax.envs.task import Command
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.visualize.viewer.guard import PARAMETER, guarded, is_loopback
 from hasrl_jax.visualize.viewer.live import Controls, Live, Push, View, readout
 from hasrl_jax.visualize.viewer.shapes import shapes
 
 if TYPE_CHECKING:
     import viser
 
-HOST = "127.0.0.1"  # viser's own default would let the whole network in
+HOST, ANY_HOST = "127.0.0.1", "0.0.0.0"  # viser's own default is the second
 PUSH_N = (10.0, 400.0)
 DIRECTIONS_DEG = {"to the left": 90.0, "to the right": -90.0, "forward": 0.0, "backward": 180.0}
 FLOOR_M = -0.01  # height of the model's floor
@@ -37,18 +39,22 @@ class Browser:
       live: what is shown.
       port: 0 takes any free one.
       randomized: how the choice of the robot is set at first.
+      host: address to listen on; beyond this machine, `url` has a token that is asked for.
 
     Raises:
       ConfigError: viser is missing, or the port is in use.
     """
 
-    def __init__(self, live: Live, port: int, randomized: bool = False):
+    def __init__(self, live: Live, port: int, randomized: bool = False, host: str = HOST):
         require_viser()
         import viser
 
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command prints the address
-            self._server = viser.ViserServer(host=HOST, port=free_port(port), label="hasrl_jax", verbose=False)
-        self.url = f"http://{HOST}:{self._server.get_port()}"
+        port = free_port(port, host)
+        token = None if is_loopback(host) else secrets.token_urlsafe(24)
+        with contextlib.redirect_stdout(io.StringIO()), guarded(token):  # its banner; the command prints the address
+            self._server = viser.ViserServer(host=host, port=port, label="hasrl_jax", verbose=False)
+        name = socket.gethostname() if host == ANY_HOST else host
+        self.url = f"http://{name}:{self._server.get_port()}{f'/?{PARAMETER}={token}' if token else ''}"
         self._lock = threading.Lock()  # viser calls back on threads of its own
         self._reset, self._push = False, False
         self._shown, self._episode, self._arrow_steps = 0, 0, 0
@@ -213,8 +219,8 @@ def require_viser() -> None:
         raise ConfigError(f"{MISSING} ({error})") from None
 
 
-def free_port(port: int) -> int:
-    """`port` if it can be opened on this machine; for 0, one that can.
+def free_port(port: int, host: str = HOST) -> int:
+    """`port` if it can be opened on `host`; for 0, one that can.
 
     Raises:
       ConfigError: it cannot.
@@ -222,7 +228,7 @@ def free_port(port: int) -> int:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((HOST, port))
+            probe.bind((host, port))
         except (OSError, OverflowError) as error:
-            raise ConfigError(f"--port: got {port}, which cannot be opened ({error}); 0 takes a free one") from None
+            raise ConfigError(f"--port: got {port}, not to be opened on {host} ({error}); 0 takes a free one") from None
         return int(probe.getsockname()[1])
