@@ -53,16 +53,17 @@ def _number(value: Any) -> float:
 
 def differences(configs: list[Config]) -> list[str]:
     """What tells runs apart, "policy_learning_rate 0.0006": one text per run, empty where nothing does."""
-    flat = [dict(_leaves(to_dict(config))) for config in configs]
+    flat = [dict(leaves(to_dict(config))) for config in configs]
     ignored = ("run_dir", "total_env_steps", "evaluate.", "checkpoint.", "seed")
     names = [n for n in flat[0] if not n.startswith(ignored) and len({repr(values[n]) for values in flat}) > 1]
     return [", ".join(f"{name.rpartition('.')[2]} {values[name]}" for name in names) for values in flat]
 
 
-def _leaves(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+def leaves(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """(dotted name, value) of every setting."""
     found = []
     for name, value in values.items():
-        found += _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
+        found += leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
     return found
 
 
