@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.convert import flat, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import RunError
 from hasrl_jax.evaluate.palette import COLORS
@@ -115,10 +115,10 @@ def last_values(runs: list[RunData]) -> list[list[str]]:
 
 def setting_rows(runs: list[RunData]) -> list[list[str]]:
     """Every setting that not all runs have alike."""
-    flat = [dict(curves.leaves(to_dict(run.config))) for run in runs]
-    names = dict.fromkeys(name for values in flat for name in values)
-    differs = [n for n in names if n != "run_dir" and len({repr(values.get(n, MISSING)) for values in flat}) > 1]
-    return [[name, *(str(values.get(name, MISSING)) for values in flat)] for name in differs]
+    leaves = [flat(to_dict(run.config)) for run in runs]
+    names = dict.fromkeys(name for values in leaves for name in values)
+    differs = [n for n in names if n != "run_dir" and len({repr(values.get(n, MISSING)) for values in leaves}) > 1]
+    return [[name, *(str(values.get(name, MISSING)) for values in leaves)] for name in differs]
 
 
 def score_rows(runs: list[RunData]) -> list[list[str]]:
