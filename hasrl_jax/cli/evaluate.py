@@ -17,6 +17,7 @@ from hasrl_jax.evaluate import scorecard
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.evaluate.statistics import SETTLE_S, summarize
 from hasrl_jax.policy.loading import load_baseline, load_policy_parameters
+from hasrl_jax.runs.trackers import Trackers
 
 MAX_SECONDS = 3600.0
 MIN_SCORECARD_S = SETTLE_S + 1.0
@@ -57,6 +58,10 @@ def _write_scorecard(known: argparse.Namespace, rest: list[str], arguments: list
     }
     command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
     scorecard.write(known.scorecard, played, known.episodes, known.seconds, known.seed, command)
+    if known.run_dir:
+        with Trackers(trained, known.run_dir) as trackers:  # those that the run was told to
+            for path in sorted(known.scorecard.glob("scorecard.*")):
+                trackers.attach("scorecard", path)
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:

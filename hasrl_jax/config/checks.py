@@ -26,6 +26,8 @@ def check(config: Config) -> None:
         works = f"'sync' or 'overlap' with backend {config.backend}{reason}; decoupled needs cpu_pool"
         require(config.schedule != "decoupled", "schedule", config.schedule, works)
     _check_machines(config)
+    for name, value in (("video.width", config.video.width), ("video.height", config.video.height)):
+        require(value % 2 == 0, name, value, "an even number")
     _check_path("run_dir", config.run_dir)
     further = tasks.find(config.task).check
     if further:

@@ -121,3 +121,11 @@ def _scalar(value: Any, hint: Any, path: str) -> Any:
     if not finite:
         raise ConfigError(f"{path}: got {shown(value)}; expected a finite number")
     return hint(value)
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found

@@ -123,6 +123,23 @@ class EvaluateConfig:
 
 
 @dataclass(frozen=True)
+class VideoConfig:
+    # film the policy every this many iterations into films/ of the run, by a process of its own; 0 never
+    every_iterations: Annotated[int, Limits(0, 10**9)] = 0
+    seconds: Annotated[float, Limits(0.1, 600)] = 8.0  # length of a film, s
+    width: Annotated[int, Limits(64, 4096)] = 320  # pixels, an even number
+    height: Annotated[int, Limits(64, 4096)] = 240  # pixels, an even number
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    to: tuple[Literal["wandb", "mlflow"], ...] = ()  # trackers beside TensorBoard; each is an extra of the package
+    project: str = "hasrl_jax"  # W&B's project, MLflow's experiment
+    name: str = ""  # of the run there; empty takes that of its directory
+    offline: bool = True  # W&B: keep everything in the run directory, for `wandb sync`
+
+
+@dataclass(frozen=True)
 class CheckpointConfig:
     every_iterations: Annotated[int, Limits(0, 10**9)] = 20  # save every this many iterations (and always at the end)
     keep: Annotated[int, Limits(1, 10**6)] = 3  # newest checkpoints kept
@@ -162,6 +179,8 @@ class Config:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     decoupled: DecoupledConfig = field(default_factory=DecoupledConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
     @property

@@ -69,7 +69,7 @@ class MetricsWriter:
         Raises:
           RunError: it cannot be written; the file then ends with the record before.
         """
-        finite = {name: _finite(value) for name, value in record.items()}
+        finite = {name: plain_number(value) for name, value in record.items()}
         line = json.dumps(finite, allow_nan=False).encode() + b"\n"
         end = self._file.seek(0, os.SEEK_END)
         try:
@@ -187,12 +187,15 @@ class NullLogger:
     def update(self, record: Mapping[str, float | int | None]) -> None:
         """Does nothing."""
 
+    def attach(self, name: str, path: Path) -> None:
+        """Does nothing."""
+
 
 def progress_line(record: Mapping[str, float | int | None]) -> str:
     """A record as one line for the terminal; what is unknown shows as a dash, a missing test not at all."""
 
     def show(name: str, form: str) -> str:
-        value = _finite(record.get(name))
+        value = plain_number(record.get(name))
         return "-" if value is None else format(value, form)
 
     parts = [
@@ -207,7 +210,7 @@ def progress_line(record: Mapping[str, float | int | None]) -> str:
     return " | ".join(parts)
 
 
-def _finite(value: float | int | None) -> float | int | None:
+def plain_number(value: float | int | None) -> float | int | None:
     """A plain number; None for None, NaN and the infinities, which JSON does not know."""
     if value is None:
         return None

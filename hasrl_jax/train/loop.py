@@ -26,8 +26,10 @@ from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.directory import CONFIG_FILE, RunDirectory, open_run, write_config
 from hasrl_jax.runs.metrics import MetricsWriter, NullLogger, ProgressPrinter
+from hasrl_jax.runs.trackers import Trackers, require_installed
 from hasrl_jax.train import distributed
 from hasrl_jax.train.devices import prepare_jax
+from hasrl_jax.train.films import Filmer
 from hasrl_jax.types import Mirror, Record
 
 log = logging.getLogger("hasrl_jax")
@@ -75,6 +77,7 @@ def train(
       init_policy: a policy file, a run directory or "released", whose parameters a new run starts from.
       make_update: makes the learner's program; benchmarks put another in its place.
     """
+    require_installed(config)
     with stop_signal() as stop:
         prepare_jax(config)
         distributed.join(config)
@@ -104,8 +107,11 @@ def _run(parts: list[Part], state: RunState, run: RunDirectory, resume: bool, st
     with (
         MetricsWriter(run.path, state.progress.iteration) if reports else NullLogger() as writer,
         ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else NullLogger() as printer,
+        Trackers(config, run.path) if reports else NullLogger() as trackers,
+        Filmer(run.path, trackers.attach, reports) as filmer,
     ):
-        state = run_iterations(parts, state, run, stop, [writer.write, printer.update])
+        trackers.attach("config", run.path / CONFIG_FILE)
+        state = run_iterations(parts, state, run, stop, [writer.write, trackers.write, printer.update], filmer)
     progress = state.progress
     log.info("%d environment steps in %d iterations; saved in %s", progress.env_steps, progress.iteration, run.path)
 
@@ -147,7 +153,12 @@ def progress_from(extra: dict[str, Any], config: Config) -> Progress:
 
 
 def run_iterations(
-    parts: list[Part], state: RunState, run: RunDirectory, stop: "Stop", report: list[Callable[[Record], None]]
+    parts: list[Part],
+    state: RunState,
+    run: RunDirectory,
+    stop: "Stop",
+    report: list[Callable[[Record], None]],
+    filmer: Filmer,
 ) -> RunState:
     """Collects and learns until the run ends or `stop` is true; returns what it saved.
 
@@ -157,6 +168,7 @@ def run_iterations(
       run: takes the checkpoints.
       stop: asked after every iteration.
       report: given the metrics of every iteration.
+      filmer: films the policy where `video` asks for it.
     """
     learner, progress, env_states = state
     stages = curriculum.Stages(parts[0].config.stages, progress.stage, progress.history)
@@ -195,6 +207,7 @@ def run_iterations(
                 "wait_seconds": update_started - started,
                 "update_seconds": now - update_started,
             }
+            filmer.after(config, learner, progress.iteration)
             due_for_evaluation = due(progress.iteration, config.evaluate.every_iterations)
             if config.distributed.process_id == 0 and (due_for_evaluation or ended(config, progress)):
                 record |= evaluation_record(config, part.task, learner)

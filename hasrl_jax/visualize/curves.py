@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hasrl_jax.config.convert import to_dict
+from hasrl_jax.config.convert import flat, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import RunError
 from hasrl_jax.evaluate.palette import COLORS
@@ -53,17 +53,10 @@ def _number(value: Any) -> float:
 
 def differences(configs: list[Config]) -> list[str]:
     """What tells runs apart, "policy_learning_rate 0.0006": one text per run, empty where nothing does."""
-    flat = [dict(_leaves(to_dict(config))) for config in configs]
+    leaves = [flat(to_dict(config)) for config in configs]
     ignored = ("run_dir", "total_env_steps", "evaluate.", "checkpoint.", "seed")
-    names = [n for n in flat[0] if not n.startswith(ignored) and len({repr(values[n]) for values in flat}) > 1]
-    return [", ".join(f"{name.rpartition('.')[2]} {values[name]}" for name in names) for values in flat]
-
-
-def _leaves(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found = []
-    for name, value in values.items():
-        found += _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
-    return found
+    names = [n for n in leaves[0] if not n.startswith(ignored) and len({repr(values[n]) for values in leaves}) > 1]
+    return [", ".join(f"{name.rpartition('.')[2]} {values[name]}" for name in names) for values in leaves]
 
 
 def fig3(runs: list[Series], names: list[str]) -> "Figure":
