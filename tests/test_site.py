@@ -65,7 +65,7 @@ def test_the_tables_of_a_task_are_complete_and_in_order() -> None:
         "`pelvis_orientation`",
         "",
         "+ − + −",
-        "w, x, y, z; in the heading frame relative to the heading to keep",
+        "w, x, y, z; quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
     ]
     assert "left hip-roll, hip-yaw, hip-pitch, knee, foot" in rows["5 to 14"][-1]
     assert "`yaw_rate`" in text and "0.4973" in text

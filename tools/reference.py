@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import importlib
 import inspect
@@ -25,7 +24,6 @@ from hasrl_jax.config.schema import StageConfig, available_cores
 from hasrl_jax.config.tasks import BUILT_IN
 from hasrl_jax.envs.cassie import rewards
 from hasrl_jax.envs.cassie import task as cassie
-from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS
 from hasrl_jax.envs.cassie.settings import RewardConfig
 from hasrl_jax.envs.layout import Entry, places
 from hasrl_jax.envs.registry import make_task
@@ -171,11 +169,10 @@ def task_tables() -> str:
 def _task_parts(name: str) -> list[str]:
     """What is said of every task."""
     task = make_task(recipe(name))
-    source = inspect.getmodule(task.step.func if isinstance(task.step, functools.partial) else task.step)
     parts = [
         f"## {name}",
-        _layout_table("Observation", task.observation, source),
-        _layout_table("Action", task.action, source),
+        _layout_table("Observation", task.observation),
+        _layout_table("Action", task.action),
     ]
     if task.commands:
         parts += [f"### Commands of {name}", _commands(task)]
@@ -184,13 +181,12 @@ def _task_parts(name: str) -> list[str]:
     return parts
 
 
-def _layout_table(title: str, entries: tuple[Entry, ...], source: ModuleType | None) -> str:
+def _layout_table(title: str, entries: tuple[Entry, ...]) -> str:
     rows = []
     for entry, place in zip(entries, places(entries).values(), strict=True):
         index = str(place.start) if entry.size == 1 else f"{place.start} to {place.stop - 1}"
         signs = " ".join("+" if sign > 0 else "−" for sign in entry.mirror)
-        beside = _comment(source, f'Entry("{entry.name}"')
-        meaning = "; ".join(text for text in (_numbers(entry, beside), beside) if text)
+        meaning = "; ".join(text for text in (_numbers(entry), entry.note) if text)
         rows.append([index, f"`{entry.name}`", entry.unit, signs, meaning])
     size = sum(entry.size for entry in entries)
     return f"### {title}, {size} {'numbers' if size > 1 else 'number'}\n\n" + table(
@@ -198,14 +194,12 @@ def _layout_table(title: str, entries: tuple[Entry, ...], source: ModuleType | N
     )
 
 
-def _numbers(entry: Entry, beside: str) -> str:
-    """What the numbers of a quantity are, in order, unless the comment beside it says so."""
-    if beside.startswith("w, x, y, z"):
-        return ""
-    if entry.legs:
-        names = MOTORS if entry.size == 2 * len(MOTORS) else PASSIVE_JOINTS
-        return f"left {', '.join(names)}; then the right leg's"
-    return "x, y, z" if entry.size == 3 else ""
+def _numbers(entry: Entry) -> str:
+    """What the numbers of a quantity are, in order."""
+    if entry.legs and entry.parts:
+        left = (name.removeprefix("left-") for name in entry.parts[: entry.size // 2])
+        return f"left {', '.join(left)}; then the right leg's"
+    return ", ".join(entry.parts)
 
 
 def _comment(module: ModuleType | None, declaration: str) -> str:

@@ -11,7 +11,7 @@ from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run, to_play
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config, EvaluateConfig
-from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.registry import make_task, make_task_on
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import scorecard
 from hasrl_jax.evaluate.rollout import run_episodes
@@ -34,7 +34,7 @@ def evaluate(arguments: list[str]) -> None:
         _write_scorecard(known, rest, arguments)
         return
     config, parameters = policy_to_play(known, rest, "evaluate")
-    task = make_task(config)
+    task = make_task_on(config, known.model, known.mapping) if known.model else make_task(config)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )
@@ -49,6 +49,11 @@ def evaluate(arguments: list[str]) -> None:
 def _write_scorecard(known: argparse.Namespace, rest: list[str], arguments: list[str]) -> None:
     scorecard.refuse_settings(rest)
     trained, parameters = load_policy_parameters(known.run_dir, known.policy)
+    command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
+    if known.model:
+        config, robot = to_play(trained, known.physics, rest, "evaluate"), scorecard.Robot(known.model, known.mapping)
+        scorecard.write_on_model(known.scorecard, robot, config, parameters, known.seed, command)
+        return
     source = known.run_dir or known.policy or "released"
     name = "the released policy" if source == "released" else Path(source).name
     policies = {name: (trained, parameters)} | {other: load_baseline(other, trained) for other in known.against}
@@ -56,7 +61,6 @@ def _write_scorecard(known: argparse.Namespace, rest: list[str], arguments: list
         policy: (to_play(config, known.physics, rest, "evaluate"), weights)
         for policy, (config, weights) in policies.items()
     }
-    command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
     scorecard.write(known.scorecard, played, known.episodes, known.seconds, known.seed, command)
     if known.run_dir:
         with Trackers(trained, known.run_dir) as trackers:  # those that the run was told to
@@ -83,7 +87,11 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument(
         "--against", nargs="*", default=[], help='more policies for the scorecard: "zero", "random", run directories'
     )
+    parser.add_argument("--model", type=Path, help="play on this MJCF file of the same robot, see docs/deploy.md")
+    parser.add_argument("--mapping", type=Path, help="YAML file of the names that differ in --model")
     known, rest = parser.parse_known_args(arguments)
+    if known.mapping and not known.model:
+        raise ConfigError("--mapping: names of a --model; give that too")
     check_number("--episodes", known.episodes, limits_of(EvaluateConfig, "episodes"))
     check_number("--seed", known.seed, limits_of(Config, "seed"))
     if known.seconds is None:
@@ -97,6 +105,8 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
             raise ConfigError(f"--scorecard: writes its own files of the mean action; leave out --{option}")
     if known.scorecard and known.seconds < MIN_SCORECARD_S:
         raise ConfigError(f"--seconds: got {known.seconds:g}; expected at least {MIN_SCORECARD_S:g} for a --scorecard")
+    if known.against and known.model:
+        raise ConfigError("--against: a scorecard compares policies on their own model; leave out --model")
     if known.against and not known.scorecard:
         raise ConfigError("--against: only a --scorecard compares policies")
     return known, rest

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import importlib
 import importlib.metadata
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ class TaskSpec:
     # The nominal robot from rest, disturbed by nobody but on request; and robots drawn at random, where there are any.
     undisturbed: Callable[[Config], Config] = lambda config: config
     randomized: Callable[[Config], Config] | None = None
+    # The task on another MJCF file of its robot, with names of ours mapped to names there; None where it cannot be.
+    make_on: Callable[[Config, Path, Mapping[str, Any]], Any] | None = None
 
 
 def find(name: str) -> TaskSpec:

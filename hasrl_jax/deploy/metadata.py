@@ -16,7 +16,7 @@ import hasrl_jax
 from hasrl_jax.config import tasks
 from hasrl_jax.config.convert import to_dict
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs import layout
+from hasrl_jax.envs import layout, motors
 from hasrl_jax.envs.layout import Entry
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
@@ -124,7 +124,11 @@ def _control(task: Task) -> dict[str, Any] | None:
 
 
 def _actuators(model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """In the order of the control: force = gain * control + bias . (1, gear * position, gear * velocity), limited."""
+    """In the order of the control: force = gain * control + bias . (1, gear * position, gear * velocity), limited.
+
+    Limited to `force_range`, and where there is a torque-speed curve, by `envs.motors`, also by that.
+    """
+    model, curve = motors.without_curve(model)
 
     def limits(limited: bool, values: np.ndarray) -> list[float] | None:
         return values.tolist() if limited else None
@@ -138,6 +142,8 @@ def _actuators(model: mujoco.MjModel) -> list[dict[str, Any]]:
             "bias": model.actuator_biasprm[index, :3].tolist(),
             "force_range": limits(bool(model.actuator_forcelimited[index]), model.actuator_forcerange[index]),
             "control_range": limits(bool(model.actuator_ctrllimited[index]), model.actuator_ctrlrange[index]),
+            "no_load_speed": None if curve is None else float(curve.no_load_speed[index]),
+            "stall_torque": None if curve is None else float(curve.stall_torque[index]),
         }
         for index in range(model.nu)
     ]

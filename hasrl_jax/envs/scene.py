@@ -36,7 +36,7 @@ def place_ground(task: Task, model: mujoco.MjModel, model_fields: dict[str, np.n
       model_fields: of the environments, [E, ...].
       env: the one whose episode it is.
     """
-    if task.ground:
+    if task.ground and "geom_pos" in model_fields:
         ground = model.geom_bodyid == 0  # the first geoms of any model
         for name in ("geom_pos", "geom_size"):
             getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]

@@ -57,6 +57,7 @@ GAIT: tuple[Column, ...] = (
     ("cost of transport", "cost_of_transport", number(2)),
     ("motor power, W", "motor_power", number(0)),
 )
+ON_MODEL: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (1, 2, 3, 4, 5, 6))
 SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
 
 
@@ -125,6 +126,17 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
     for heading, text, figures in sections:
         if figures:
             parts += [f"## {heading}\n", *filter(None, [text]), figures]
+    if report.get("models"):
+        parts += [
+            "## On other models of the robot\n",
+            "The nominal robot of other MJCF files with our PD loop and sensors put in; docs/deploy.md says how they "
+            "differ.\n",
+        ]
+    for label, found in report.get("models", {}).items():
+        walking = table(select(found["rows"], *survival), ON_MODEL)
+        count = found["rows"][0]["episodes"]
+        parts += [f"### {label}\n", f"{count} episodes a row: `{found['command']}`\n", walking]
+        parts += [f"Pushed as above:\n\n{push_table(select(found['rows'], 'push'))}"]
     if others:
         parts += ["## The same for others\n", "The nominal robot; they are played under their own gait clock.\n"]
     for name, theirs in others:

@@ -20,7 +20,7 @@ import numpy as np
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
-from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.registry import make_task, make_task_on
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
 from hasrl_jax.evaluate.page import percent, write_page
@@ -86,6 +86,7 @@ SHORT_S = 20.0  # besides the cap, survival is also told for this long
 # What every row sets itself, of `cassie`.
 SETTINGS = ("command", "motor", "push", "terrain", "termination", "randomize")
 REVISION = 4  # of what a row plays and what its figures mean; those of an earlier one are measured anew
+MODEL_EPISODES = 20  # of each row on another model
 BATCH = 25  # episodes that one job plays side by side
 
 
@@ -116,6 +117,27 @@ class Row(NamedTuple):
         if self.disturbance:
             speed += f", {self.disturbance}"
         return f"{speed}, {self.push_n:g} N push" if self.push_n else speed
+
+
+class Robot(NamedTuple):
+    """Another MJCF file of the robot to play on, as `make_task_on` takes it."""
+
+    file: Path
+    mapping: Path | None = None
+
+    @property
+    def label(self) -> str:
+        """The file with its folder: most are called alike."""
+        return "/".join(self.file.absolute().parts[-2:])
+
+
+def model_rows() -> list[Row]:
+    """The rows that are played on another model of the robot: those that say most."""
+    return [
+        *(Row("speed", (v, v)) for v in (0.0, 1.0, 2.0, 3.0, 4.0)),
+        Row("changing", CHANGING_M_S[0], (-0.1, 0.1)),
+        Row("push", (1.0, 1.0), push_n=150.0),
+    ]
 
 
 def rows(trained: Config) -> list[Row]:
@@ -225,6 +247,10 @@ def write(
     report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
     report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
     earlier = _read(path)
+    own_digest = _digest(*next(iter(policies.values())), seconds)
+    report["models"] = {
+        label: found for label, found in earlier.get("models", {}).items() if found["policy_digest"] == own_digest
+    }
     same = all(earlier.get(name) == report[name] for name in ("episodes", "seconds", "seed"))
     for name, (config, parameters) in policies.items():
         digest = report["digests"][name] = _digest(config, parameters, seconds)
@@ -241,6 +267,40 @@ def write(
             robot = "randomised" if row["randomized"] else "nominal"
             share, spent = percent(row["share_up"]), time.monotonic() - started
             log.info("%s, %s, %s: %s up, %.0f s so far", name, row["title"], robot, share, spent)
+    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write_page(report, directory)
+
+
+def write_on_model(
+    directory: Path, robot: Robot, config: Config, parameters: Parameters, seed: int, command: str
+) -> None:
+    """Adds to a scorecard how its policy does on another model of the robot; the rest of the card stays.
+
+    Args:
+      directory: holds the scorecard.
+      robot: the other model.
+      config: of the card's policy, with the physics to play under.
+      parameters: of the card's policy.
+      seed: as in `measure`.
+      command: what to type for the same numbers, for the page.
+
+    Raises:
+      ConfigError: there is no scorecard, or the model cannot be played on; OSError: it cannot be written.
+    """
+    path = directory / "scorecard.json"
+    report = _read(path)
+    if not report.get("policies"):
+        raise ConfigError(f"--scorecard: {path} holds no scorecard; expected one made without --model")
+    make_task_on(row_config(config, model_rows()[0], SHORT_S), *robot)  # complains before the work
+    entry: dict[str, Any] = {
+        "policy_digest": _digest(config, parameters, report["seconds"]),
+        "command": command,
+        "rows": [],
+    }
+    for row in measure(config, parameters, MODEL_EPISODES, SHORT_S, seed, chosen=model_rows(), robot=robot):
+        entry["rows"].append(row)
+        log.info("%s, %s: %s up", robot.label, row["title"], percent(row["share_up"]))
+    report.setdefault("models", {})[robot.label] = entry
     path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     write_page(report, directory)
 
@@ -276,9 +336,16 @@ def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
 
 
 def measure(
-    trained: Config, parameters: Parameters, episodes: int, seconds: float, seed: int, skip: int = 0
+    trained: Config,
+    parameters: Parameters,
+    episodes: int,
+    seconds: float,
+    seed: int,
+    skip: int = 0,
+    chosen: list[Row] | None = None,
+    robot: Robot | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Plays the rows and yields each one's results, ready for JSON, in the order of `rows`.
+    """Plays the rows and yields each one's results, ready for JSON, in their order.
 
     Args:
       trained: the policy's configuration, with the physics to play under.
@@ -287,10 +354,12 @@ def measure(
       seconds: time limit of the longest episodes, see `row_config`.
       seed: the same seed gives the same numbers, whatever the number of cores.
       skip: rows to leave out at the beginning.
+      chosen: the rows; by default all, `rows`.
+      robot: another model to play on.
     """
     jobs = [
-        (row, row_config(trained, row, seconds), parameters, min(BATCH, episodes - done), [seed, number, done])
-        for number, row in enumerate(rows(trained))
+        (row, row_config(trained, row, seconds), parameters, min(BATCH, episodes - done), [seed, number, done], robot)
+        for number, row in enumerate(rows(trained) if chosen is None else chosen)
         if number >= skip
         for done in range(0, episodes, BATCH)
     ]
@@ -305,10 +374,10 @@ def measure(
                 parts = []
 
 
-def _play(job: tuple[Row, Config, Parameters, int, list[int]]) -> dict[str, np.ndarray]:
+def _play(job: tuple[Row, Config, Parameters, int, list[int], Robot | None]) -> dict[str, np.ndarray]:
     """Per-episode figures of a part of a row, each [N]."""
-    _, config, parameters, episodes, seed = job
-    task = make_task(config)
+    _, config, parameters, episodes, seed, robot = job
+    task = make_task(config) if robot is None else make_task_on(config, *robot)
     cap_s = config.collect.max_episode_steps * config.physics.env_step_s
     played = run_episodes(config, task, parameters, episodes, seed, seconds=cap_s)
     column = columns(played, task)

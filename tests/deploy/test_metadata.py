@@ -71,6 +71,18 @@ def test_the_formula_of_the_control_is_what_the_task_applies(recipe):
     assert np.abs(given).max() > 0.5
 
 
+def test_motors_with_a_curve_are_told_with_their_gains():
+    config = from_dict({"cassie": {"motor": {"torque_speed_curve": True}}}, shipped("cassie_walk"))
+    rows = metadata.describe(config, "")["actuators"]
+    plain = metadata.describe(shipped("cassie_walk"), "")["actuators"]
+    assert rows[2]["no_load_speed"] == pytest.approx(1300 / 60 * 2 * np.pi / 16)
+    assert rows[2]["stall_torque"] == pytest.approx(2 * 195.2)
+    assert {row["no_load_speed"] for row in plain} == {row["stall_torque"] for row in plain} == {None}
+    for with_curve, without in zip(rows, plain, strict=True):
+        for name in ("gain", "bias", "force_range"):
+            assert with_curve[name] == pytest.approx(without[name])
+
+
 def test_a_task_whose_control_is_no_such_formula_has_none(monkeypatch):
     config = shipped("cartpole")
     squared = dataclasses.replace(make_task(config), control=lambda state, action, xp: action**2)

@@ -1,6 +1,8 @@
 """Where the numbers of the Cassie task stand in the arrays of its model; names become indices here and nowhere else."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -8,6 +10,7 @@ import numpy as np
 MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")  # per leg, left leg first
 PASSIVE_JOINTS = ("shin", "tarsus", "foot")  # per leg, left leg first
 SIDES = ("left", "right")
+NO_NAMES: Mapping[str, str] = MappingProxyType({})  # everything is called as in our file
 
 
 Place = np.ndarray | slice
@@ -35,13 +38,26 @@ def evenly_spaced(indices: np.ndarray) -> Place:
     return slice(start, end + 1, int(steps[0])) if len(steps) == 1 and steps[0] > 0 else indices
 
 
-def cassie_ids(model: mujoco.MjModel) -> CassieIds:
-    """Resolves every name that the task reads."""
-    motors = [model.joint(f"{side}-{name}") for side in SIDES for name in MOTORS]
-    passive = [model.joint(f"{side}-{name}") for side in SIDES for name in PASSIVE_JOINTS]
+def cassie_ids(
+    model: mujoco.MjModel, joints: Mapping[str, str] = NO_NAMES, sensors: Mapping[str, str] = NO_NAMES
+) -> CassieIds:
+    """Resolves every name that the task reads.
 
-    def sensors(*names: str) -> np.ndarray:
-        return np.array([model.sensor(name).adr[0] + np.arange(model.sensor(name).dim[0]) for name in names])
+    Args:
+      model: of the robot.
+      joints: what `model` calls them, by their name in our file, where it differs.
+      sensors: the same for sensors.
+    """
+
+    def joints_of_both(names: tuple[str, ...]) -> list[Any]:
+        ours = [f"{side}-{name}" for side in SIDES for name in names]
+        return [model.joint(joints.get(name, name)) for name in ours]
+
+    def places(*names: str) -> np.ndarray:
+        found = [model.sensor(sensors.get(name, name)) for name in names]
+        return np.array([sensor.adr[0] + np.arange(sensor.dim[0]) for sensor in found])
+
+    motors, passive = joints_of_both(MOTORS), joints_of_both(PASSIVE_JOINTS)
 
     return CassieIds(
         motor_qpos=np.array([joint.qposadr[0] for joint in motors]),
@@ -49,10 +65,10 @@ def cassie_ids(model: mujoco.MjModel) -> CassieIds:
         passive_qpos=np.array([joint.qposadr[0] for joint in passive]),
         passive_qvel=np.array([joint.dofadr[0] for joint in passive]),
         hip_roll_qvel=np.array([motors[0].dofadr[0], motors[5].dofadr[0]]),
-        acceleration=evenly_spaced(sensors("pelvis-acceleration")[0]),
-        foot_force=evenly_spaced(sensors("left-foot-force", "right-foot-force")[:, 0]),
-        foot_orientation=sensors("left-foot-orientation", "right-foot-orientation"),
-        foot_velocity=sensors("left-foot-velocity", "right-foot-velocity"),
-        torque=evenly_spaced(sensors(*(f"{side}-{name}-torque" for side in SIDES for name in MOTORS))[:, 0]),
-        motor_speed=evenly_spaced(sensors(*(f"{side}-{name}-speed" for side in SIDES for name in MOTORS))[:, 0]),
+        acceleration=evenly_spaced(places("pelvis-acceleration")[0]),
+        foot_force=evenly_spaced(places("left-foot-force", "right-foot-force")[:, 0]),
+        foot_orientation=places("left-foot-orientation", "right-foot-orientation"),
+        foot_velocity=places("left-foot-velocity", "right-foot-velocity"),
+        torque=evenly_spaced(places(*(f"{side}-{name}-torque" for side in SIDES for name in MOTORS))[:, 0]),
+        motor_speed=evenly_spaced(places(*(f"{side}-{name}-speed" for side in SIDES for name in MOTORS))[:, 0]),
     )

@@ -4,17 +4,20 @@ Both physics engines apply the same fields, so the same draws give the same robo
 Source: paper section II.D; ranges of the published implementation.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from hasrl_jax.envs import motors
+from hasrl_jax.envs.cassie.ids import NO_NAMES, SIDES
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
 from hasrl_jax.envs.draws import between
 from hasrl_jax.types import Array
 
 DAMPED_JOINTS = ("hip-roll", "hip-yaw", "hip-pitch", "achilles-rod", "knee", "shin", "tarsus", "foot-crank", "foot")
+SPRINGS = ("shin", "heel-spring")  # joints of the leaf springs
 PELVIS = "cassie-pelvis"
 # Drawn only where a setting says more than the paper; how many numbers each consumes at a reset.
 BEYOND_PAPER = {
@@ -60,12 +63,22 @@ class WeightTerms(NamedTuple):
     dof_average: np.ndarray  # [nv, nv] averages over the degrees of freedom that share a weight
 
 
-def nominal(model: mujoco.MjModel) -> Nominal:
-    """Reads the constants once. `model`: the compiled nominal robot."""
+def nominal(
+    model: mujoco.MjModel, joints: Mapping[str, str] = NO_NAMES, bodies: Mapping[str, str] = NO_NAMES
+) -> Nominal:
+    """Reads the constants once.
+
+    Args:
+      model: the compiled nominal robot.
+      joints: what `model` calls them, by their name in our file, where it differs.
+      bodies: the same for bodies.
+    """
     subtree = np.eye(model.nbody)
     for body in range(model.nbody - 1, 0, -1):
         subtree[model.body_parentid[body]] += subtree[body]
-    damped = [model.joint(f"{side}-{joint}").id for side in ("left", "right") for joint in DAMPED_JOINTS]
+    names = [f"{side}-{joint}" for side in SIDES for joint in DAMPED_JOINTS]
+    damped = [model.joint(joints.get(name, name)).id for name in names]
+    springs = [f"{side}-{joint}" for side in SIDES for joint in SPRINGS]
     gain_columns = np.zeros(model.actuator_gainprm.shape[1])
     has_curve = motors.without_curve(model)[1] is not None
     gain_columns[[motors.STIFFNESS, motors.DAMPING] if has_curve else 0] = 1.0
@@ -83,8 +96,8 @@ def nominal(model: mujoco.MjModel) -> Nominal:
         subtree=subtree,
         dof_draw=np.array([damped.index(joint) if joint in damped else -1 for joint in model.dof_jntid]),
         num_damping=len(damped),
-        springs=np.flatnonzero(model.jnt_stiffness),
-        pelvis=model.body(PELVIS).id,
+        springs=np.array([model.joint(joints.get(name, name)).id for name in springs]),
+        pelvis=model.body(bodies.get(PELVIS, PELVIS)).id,
         gain_columns=gain_columns,
         weights=_weight_terms(model),
     )

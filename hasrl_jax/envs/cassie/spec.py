@@ -7,7 +7,7 @@ from hasrl_jax.config.limits import require
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.config.tasks import TaskSpec
 from hasrl_jax.envs.cassie.settings import CassieConfig
-from hasrl_jax.envs.cassie.task import make
+from hasrl_jax.envs.cassie.task import make, make_on
 
 
 def check(config: Config) -> None:
@@ -62,6 +62,7 @@ def reference_physics() -> PhysicsConfig:
 SPEC = TaskSpec(
     name="cassie",
     make=make,
+    make_on=make_on,
     recipe=CONFIG_FOLDER / "cassie_walk.yaml",
     settings=CassieConfig,
     check=check,

@@ -4,6 +4,7 @@ Source: paper section II.A to II.D; constants of the published implementation.
 """
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,13 +14,15 @@ import numpy as np
 
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout, motors
-from hasrl_jax.envs.cassie import clock, commands, randomize, rewards, terrain
+from hasrl_jax.envs.cassie import clock, commands, other_model, randomize, rewards, terrain
 from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
+from hasrl_jax.envs.cassie.other_model import Names
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
 from hasrl_jax.envs.draws import between
 from hasrl_jax.envs.layout import AXIAL, NEGATED, QUATERNION, SAME, VECTOR, Entry
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.task import Reading, Reset, Task, Transition
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array
 
 ASSET = Path(__file__).parent / "cassie.xml"
@@ -125,14 +128,40 @@ class Constants(NamedTuple):
 def make(config: Config) -> Task:
     """The task with its model compiled and its names resolved."""
     ground = None if config.settings.terrain.kind == "flat" else partial(terrain.build, config.settings.terrain)
-    model = load_model(ASSET, config.physics, ground)
+    return _make(config, ASSET, ground, Names())
+
+
+def make_on(config: Config, file: Path, mapping: Mapping[str, Any]) -> Task:
+    """The task on another MJCF file of the robot, see `other_model`.
+
+    Args:
+      config: what a policy is played under.
+      file: the MJCF file.
+      mapping: as `other_model.names_from` takes it.
+
+    Raises:
+      ConfigError: the file cannot be read or lacks something, or the ground is not level.
+    """
+    if config.settings.terrain.kind != "flat":
+        raise ConfigError(f"cassie.terrain.kind: got {config.settings.terrain.kind}; expected flat with a --model")
+    names = other_model.names_from(mapping, ASSET)
+    try:
+        return _make(config, file, partial(other_model.adapt, names, file, ASSET), names)
+    except ValueError as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"--model {file}: not an MJCF file that compiles ({' '.join(str(error).split())})") from None
+
+
+def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] | None, names: Names) -> Task:
+    model = load_model(asset, config.physics, ground)
     if config.settings.motor.torque_speed_curve:
         speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
         model = motors.with_curve(model, speeds)
-    nominal = randomize.nominal(model)
+    nominal = randomize.nominal(model, names.joints, names.bodies)
     constants = Constants(
         config=config.settings,
-        ids=cassie_ids(model),
+        ids=cassie_ids(model, names.joints, names.sensors),
         nominal=nominal,
         model=model,
         start_qpos=model.key("stand").qpos.copy(),
@@ -146,7 +175,7 @@ def make(config: Config) -> Task:
     noisy = noise_size(config.settings)
     return Task(
         name="cassie",
-        asset=ASSET,
+        asset=asset,
         ground=ground,
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
