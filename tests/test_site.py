@@ -61,12 +61,9 @@ def test_the_tables_of_a_task_are_complete_and_in_order() -> None:
     ends = [int(row.split(" to ")[-1]) for row in _rows(observation) if row[0].isdigit()]
     assert ends == [0, 4, 14, 17, 20, 30, 33, 39, 45, 47, 48, 49]
     rows = _rows(observation)
-    assert rows["1 to 4"] == [
-        "`pelvis_orientation`",
-        "",
-        "+ − + −",
-        "w, x, y, z; in the heading frame relative to the heading to keep",
-    ]
+    orientation = "w, x, y, z; in the heading frame relative to the heading to keep"
+    assert rows["1 to 4"] == ["`pelvis_orientation`", "", "+ − + −", "0.01", orientation]
+    assert rows["0"][-1] == "above the ground" and rows["18 to 20"][-1] == "x, y, z; pelvis frame"
     assert "left hip-roll, hip-yaw, hip-pitch, knee, foot" in rows["5 to 14"][-1]
     assert "`yaw_rate`" in text and "0.4973" in text
 
