@@ -24,7 +24,7 @@ bench:  ## timed figures on an idle machine, and the tables of docs/ from them
 
 docs:  ## the documentation site in site/; a warning or a dead link is an error
 	$(BIN)/pip install -q -c requirements.lock -e ".[docs]"
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 wheel:  ## wheel and sdist in dist/, checked, installed in an empty environment elsewhere, and used
 	$(BIN)/pip install -q -c requirements.lock -e ".[release]"

@@ -65,6 +65,7 @@ def test_the_tables_of_a_task_are_complete_and_in_order() -> None:
         "`pelvis_orientation`",
         "",
         "+ − + −",
+        "0.01",
         "w, x, y, z; quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
     ]
     assert "left hip-roll, hip-yaw, hip-pitch, knee, foot" in rows["5 to 14"][-1]

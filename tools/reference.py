@@ -32,6 +32,8 @@ from hasrl_jax.policy.loading import RELEASED, load_policy_parameters
 from hasrl_jax.runs.fields import FIELDS
 
 ROOT = Path(hasrl_jax.__file__).parents[1]
+LESS_IN_SEARCH = "---\nsearch: {boost: 0.2}\n---\n\n"  # what is written for people comes first
+ENDS = re.DOTALL | re.MULTILINE
 LAST_GROUPS = ("__init__", "__main__")
 
 
@@ -50,8 +52,13 @@ def pages() -> dict[str, str]:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+    lines = [header, ["---"] * len(header), *rows]  # what looks like a tag of HTML is none
+    return (
+        "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|").replace("<", "&lt;") for cell in line) + " |" for line in lines
+        )
+        + "\n"
+    )
 
 
 def configuration() -> str:
@@ -127,7 +134,8 @@ def task_tables() -> str:
         "# Observations, actions, commands",
         "Written from the tables of the tasks (`Task.observation`, `Task.action`, `Task.commands`). Everything is "
         "float32. *Mirror* is the sign of each number in the left-right mirror image; the numbers of legs also change "
-        "places. Actions are clipped to [-1, 1].",
+        "places. *Error* is the half width of the error of a noisy measurement, where noise is switched "
+        "on. Actions are clipped to [-1, 1].",
     ]
     parts += _task_parts("cassie")
     heading = make_task(from_dict({"cassie": {"command": {"frame": "heading"}}}, recipe("cassie")))
@@ -187,10 +195,11 @@ def _layout_table(title: str, entries: tuple[Entry, ...]) -> str:
         index = str(place.start) if entry.size == 1 else f"{place.start} to {place.stop - 1}"
         signs = " ".join("+" if sign > 0 else "−" for sign in entry.mirror)
         meaning = "; ".join(text for text in (_numbers(entry), entry.note) if text)
-        rows.append([index, f"`{entry.name}`", entry.unit, signs, meaning])
+        error = f"{entry.noise:g}" if entry.noise else ""
+        rows.append([index, f"`{entry.name}`", entry.unit, signs, error, meaning])
     size = sum(entry.size for entry in entries)
     return f"### {title}, {size} {'numbers' if size > 1 else 'number'}\n\n" + table(
-        ["index", "quantity", "unit", "mirror", "numbers"], rows
+        ["index", "quantity", "unit", "mirror", "error", "numbers"], rows
     )
 
 
@@ -203,9 +212,14 @@ def _numbers(entry: Entry) -> str:
 
 
 def _comment(module: ModuleType | None, declaration: str) -> str:
-    """The comment on the line of `module` that holds the text of a declaration."""
-    match = module and re.search(rf"^.*{re.escape(declaration)}.*?  # (.*)$", inspect.getsource(module), re.MULTILINE)
-    return match[1] if match else ""
+    """The first comment behind what `module` declares, before anything else is declared there.
+
+    Args:
+      module: where to look.
+      declaration: how it begins, a regular expression.
+    """
+    match = module and re.search(rf"{declaration}((?:(?!Entry\().)*?)  # (.*?)$", inspect.getsource(module), ENDS)
+    return match[2] if match and "\n)" not in match[1] else ""
 
 
 def _commands(task: Task) -> str:
@@ -306,7 +320,7 @@ def modules() -> dict[str, str]:
     for group, names in groups.items():
         about = inspect.getdoc(importlib.import_module(f"hasrl_jax.{group}" if group != "hasrl_jax" else group)) or ""
         body = "\n\n".join(f"## {name}\n\n::: {name}" for name in names)
-        pages[f"reference/api/{group}.md"] = f"# {group}\n\n{about}\n\n{body}\n"
+        pages[f"reference/api/{group}.md"] = f"{LESS_IN_SEARCH}# {group}\n\n{about}\n\n{body}\n"
     listed = "\n".join(
         f"- [{group}]({group}.md): " + ", ".join(f"`{name.rpartition('.')[2]}`" for name in names)
         for group, names in groups.items()

@@ -203,8 +203,7 @@ def camera(aspect: float) -> tuple[tuple[float, float, float], tuple[float, floa
 
 
 def _place_camera(client: "viser.ClientHandle") -> None:
-    if client.camera.aspect < NARROW:
-        client.camera.position, client.camera.look_at = camera(client.camera.aspect)
+    client.camera.position, client.camera.look_at = camera(client.camera.aspect)
 
 
 def require_viser() -> None:
