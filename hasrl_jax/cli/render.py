@@ -14,7 +14,7 @@ import numpy as np
 
 from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.visualize import opengl
+from hasrl_jax.visualize import course, opengl
 from hasrl_jax.visualize.render import SHADOW_PX, Commands, Push, film, play
 
 COMMAND_OPTIONS = ("forward", "lateral", "yaw_rate")  # commands with an option of their own; --command takes any
@@ -31,6 +31,8 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     from hasrl_jax.config.convert import from_dict
     from hasrl_jax.envs.gymnasium import TaskEnv
 
+    if known.course:
+        known.seconds = course.SLICE_S * len(course.sliced(course.COURSES[known.course]))
     _check(known)
     config, parameters = policy_to_play(known, [], "render")
     # The nominal robot, so that the film runs in real time, what was asked for and nothing else, and no time limit.
@@ -42,6 +44,8 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     try:
         if known.push and env.task.with_push is None:
             raise ConfigError(f"--push: the robot of task {config.task} cannot be pushed; leave it out")
+        if known.course:
+            course.check(known.course, course.COURSES[known.course], env.task.commands)
         for told in commands:
             env.check_command(told)
         frames = max(1, round(known.seconds / env.task.env_step_s))
@@ -61,6 +65,8 @@ def _commands(known: argparse.Namespace) -> Commands:
             told[name.replace("-", "_")] = float(value)
         except ValueError:
             raise ConfigError(f"--command: got {text}; expected NAME=NUMBER, as in height=0.8") from None
+    if known.course:
+        return course.sliced(course.COURSES[known.course])
     if known.speeds:
         return [told | {"forward": speed} for speed in known.speeds]
     return [told] if told else []
@@ -81,6 +87,9 @@ def _check(known: argparse.Namespace) -> None:
             raise ConfigError(f"--{name}: got {value}; expected an even number from 64 to 4096")
     if known.speeds and known.forward is not None:
         raise ConfigError("--speeds and --forward: give only one of them")
+    others = [name for name in (*COMMAND_OPTIONS, "speeds", "command") if getattr(known, name) is not None]
+    if known.course and others:
+        raise ConfigError(f"--course and --{others[0].replace('_', '-')}: give only one of them")
     for name in (*COMMAND_OPTIONS, "push", "push_at", "speeds"):
         value = getattr(known, name)
         if value is not None and not np.isfinite(value).all():
@@ -107,6 +116,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--lateral", type=float, help="commanded speed to the left, m/s")
     parser.add_argument("--yaw-rate", type=float, help="commanded turning rate to the left, rad/s")
     parser.add_argument("--command", nargs="+", metavar="NAME=NUMBER", help="any of the task's commands, height=0.8")
+    parser.add_argument("--course", choices=tuple(course.COURSES), help="instead: what to tell when, for its own time")
     parser.add_argument("--push", type=float, default=0.0, help="force to the left on the pelvis for 0.2 s, N")
     parser.add_argument("--push-at", type=float, default=3.0, help="when the push begins, s")
     parser.add_argument("--width", type=int, default=640, help="pixels")

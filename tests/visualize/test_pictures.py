@@ -15,7 +15,8 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
-from hasrl_jax.visualize.pictures import gait, rewards
+from hasrl_jax.visualize.course import COURSES
+from hasrl_jax.visualize.pictures import commands, course, gait, rewards
 from hasrl_jax.visualize.pictures.record import Recording, record
 
 
@@ -26,6 +27,7 @@ def _random_policy(config: Config) -> dict[str, np.ndarray]:
 
 
 SMALL = from_dict({"network": {"hidden_size": 8}})
+STEERED = from_dict({"network": {"hidden_size": 8}, "cassie": {"command": {"frame": "heading"}}})
 
 
 def test_records_the_commands_in_turn() -> None:
@@ -75,7 +77,10 @@ def test_smoothing_over_a_cycle_leaves_the_mean() -> None:
 
 @pytest.mark.parametrize("name", list(pictures.DRAWINGS))
 def test_the_command_writes_a_small_picture(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = from_dict({"physics": {"timestep_s": 0.0025, "steps_per_env_step": 10}}, SMALL)
+    small = STEERED if name in ("course", "commands") else SMALL
+    config = from_dict({"physics": {"timestep_s": 0.0025, "steps_per_env_step": 10}}, small)
+    monkeypatch.setattr(commands, "EACH", 1)
+    monkeypatch.setattr(commands, "SECONDS", 0.2)
     path, out = tmp_path / "policy.npz", tmp_path / "out.png"
     checkpoint.save_policy(path, _random_policy(config), policies.policy_metadata(config))
     monkeypatch.setattr(gait, "record", lambda *_: _walk(280))
@@ -112,3 +117,34 @@ def test_bad_arguments_are_one_line(
     assert named in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_the_path_that_a_course_describes() -> None:
+    """A quarter of a circle to the left, then sideways to the right: by hand."""
+    step_s, rate, speed = 0.025, np.pi / 2, 1.0
+    told = [{"forward": speed, "yaw_rate": rate}] * 4 + [{"lateral": -0.5}] * 4  # one second of each
+    path = course.exact(told, 10, step_s)
+    radius = speed / rate
+    np.testing.assert_allclose(path[39], [radius, radius], atol=0.02)
+    np.testing.assert_allclose(path[79] - path[39], [0.5, 0.0], atol=1e-6)  # facing y, its right is x
+
+
+def test_a_course_is_walked_until_the_robot_falls() -> None:
+    path = course.walk(STEERED, _random_policy(STEERED), "slalom", COURSES["slalom"], 0)
+    assert path.fell
+    assert len(path.position) == len(path.heading) == len(path.asked) < 400
+    with pytest.raises(ConfigError, match=r"--course: slalom tells yaw_rate, .* understands forward, lateral"):
+        course.walk(SMALL, _random_policy(SMALL), "slalom", COURSES["slalom"], 0)
+
+
+def test_a_grid_of_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that stands for ever: it is upright everywhere, and its error is the command."""
+    monkeypatch.setattr(commands, "SECONDS", 0.2)
+    monkeypatch.setattr(commands, "SETTLED_S", 0.1)
+    grid = commands.measure(STEERED, _random_policy(STEERED), "yaw_rate", (-0.5, 0.0), 0)
+    assert grid.up.shape == grid.forward_error.shape == (2, 8)
+    assert (grid.up == 1.0).all()
+    np.testing.assert_allclose(grid.forward_error[0], np.abs(commands.FORWARD_M_S), atol=0.3)
+    assert grid.other_error.mean() < 1.5
+    with pytest.raises(ConfigError, match="needs the commands forward and yaw_rate"):
+        commands.measure(SMALL, _random_policy(SMALL), "yaw_rate", (0.0,), 0)
