@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, NamedTuple, cast
 
@@ -32,7 +32,18 @@ from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
 log = logging.getLogger("hasrl_jax")
 MAX_FAILURES = 3  # of one worker among its last ATTEMPTS requests
 ATTEMPTS = 6
+# Environment variables that workers are given, by how their names begin; keys and passwords of other programs are not.
+GIVEN_VARIABLES = (
+    *("PATH", "HOME", "TMPDIR", "LANG", "LC_", "TZ", "LD_", "DYLD_", "PYTHON", "VIRTUAL_ENV", "COVERAGE_"),
+    *("OPENBLAS_", "OMP_", "MKL_", "MUJOCO_", "MJ_", "NPY_", "HASRL_"),
+)
 LONGEST_LOOK_S = 2.0  # time between two looks at the workers that counts; what is more was a pause of this process
+
+
+def worker_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """What of `environment` a worker is given; a task that needs more calls it HASRL_*."""
+    given = {name: value for name, value in environment.items() if name.startswith(GIVEN_VARIABLES)}
+    return blas_variables() | given | ONE_THREAD
 
 
 class _Worker(NamedTuple):
@@ -239,7 +250,7 @@ class CpuPool:
             [sys.executable, "-m", "hasrl_jax.collect.worker", *map(str, descriptors)],
             pass_fds=descriptors,
             stdin=subprocess.DEVNULL,
-            env=blas_variables() | os.environ | ONE_THREAD,
+            env=worker_environment(os.environ),
         )
         theirs.close()
         setup = {"config": to_dict(self.config), "index": index, "parent": os.getpid()}

@@ -170,6 +170,7 @@ class Config:
     stages: tuple[StageConfig, ...] = ()  # settings that change on the way
     compilation_cache: bool = True  # keep compiled programs in the user's cache directory
     run_dir: str = ""  # where the run is written; empty makes runs/<task>-<time>
+    private: bool = False  # the directory of a new run is open to its owner alone
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)

@@ -49,7 +49,8 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
       resume: continue the run that is there.
 
     Raises:
-      RunError: in use by another process, holds a run already, holds none to resume, or cannot be written.
+      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, or
+        cannot be written.
     """
     if resume:
         path = Path(config.run_dir)
@@ -61,6 +62,7 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
     if config.distributed.process_id:  # the first process holds it for all
         yield RunDirectory(path)
         return
+    _require_inside(path)
     with _locked(path):
         if not resume:
             _require_no_run(path)
@@ -104,19 +106,39 @@ def _create(config: Config) -> Path:
     try:
         if config.run_dir:
             path.mkdir(parents=True, exist_ok=True)
-            return path
+            return _protected(path, config)
         name = f"{config.task}-{time.strftime('%Y%m%d-%H%M%S')}"
         for suffix in ("", *(f"-{number}" for number in range(2, 1000))):
             path = Path("runs", name + suffix)
             try:
                 path.mkdir(parents=True)
-                return path
+                return _protected(path, config)
             except FileExistsError:
                 if not path.is_dir():  # `runs` itself is a file
                     raise
         raise RunError(f"{path}: too many runs were started in the same second")
     except OSError as error:
         raise RunError(f"{path}: the run directory cannot be created: {_reason(error)}") from None
+
+
+def _protected(path: Path, config: Config) -> Path:
+    """`path`, which none but its owner can enter if the configuration wants it so."""
+    if config.private:
+        path.chmod(0o700)
+    return path
+
+
+def _require_inside(path: Path) -> None:
+    """Refuses a run whose files are links to somewhere else: what is written or read would not be of this run.
+
+    Raises:
+      RunError: names the link.
+    """
+    inside = path.resolve()
+    for name in (CONFIG_FILE, METRICS_FILE, TENSORBOARD_DIRECTORY, CHECKPOINTS_DIRECTORY, LOCK_FILE):
+        place = path / name
+        if not place.resolve().is_relative_to(inside):
+            raise RunError(f"{place}: a link that leads out of the run, to {place.resolve()}; put what it names here")
 
 
 def _require_run(path: Path) -> None:
@@ -126,6 +148,7 @@ def _require_run(path: Path) -> None:
         runs = [parent for parent in path.resolve().parents[:2] if (parent / CONFIG_FILE).is_file()]
         hint = f"; did you mean {runs[0]}?" if runs else ""
         raise RunError(f"{path}: not a run directory, it has no {CONFIG_FILE}{hint}")
+    _require_inside(path)
 
 
 def _require_no_run(path: Path) -> None:

@@ -52,6 +52,18 @@ def parameters(make_config, make_parameters):
     return make_parameters(make_config())
 
 
+def test_workers_are_given_no_more_of_the_environment_than_they_need(make_pool, monkeypatch):
+    monkeypatch.setenv("CLOUD_SECRET_KEY", "abc")
+    monkeypatch.setenv("HASRL_ASSETS", "there")
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    make_pool(num_workers=1)
+    (worker,) = [child for child in psutil.Process().children() if "hasrl_jax.collect.worker" in child.cmdline()]
+    given = worker.environ()
+    assert "CLOUD_SECRET_KEY" not in given
+    assert (given["HASRL_ASSETS"], given["PATH"]) == ("there", os.environ["PATH"])
+    assert (given["OMP_NUM_THREADS"], given["OPENBLAS_NUM_THREADS"]) == ("1", "1")
+
+
 def run(pool, parameters, iteration=0):
     pool.start(parameters, iteration, version=iteration)
     return pool.finish()

@@ -56,6 +56,22 @@ def make_pool(make_config, cluster):
     assert not ray.is_initialized()
 
 
+def test_a_cluster_is_joined_with_a_token_or_on_purpose_without(tmp_path, monkeypatch):
+    settings = RayConfig(address="10.0.0.1:6379")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+        monkeypatch.delenv(name)
+    with pytest.raises(ConfigError, match=r"^ray.address: 10.0.0.1:6379 is joined with its token; expected .*~/.ray"):
+        import_ray(settings)
+    assert os.environ["RAY_AUTH_MODE"] == "token"
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    assert import_ray(settings) is ray
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    (tmp_path / ".ray").mkdir()
+    (tmp_path / ".ray" / "auth_token").write_text("0" * 64)
+    assert import_ray(settings) is ray
+
+
 @pytest.fixture
 def parameters(make_config, make_parameters):
     return make_parameters(make_config())

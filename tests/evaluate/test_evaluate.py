@@ -25,7 +25,6 @@ from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 
 PHYSICS = {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"}
-COMMANDS = make_task(from_dict({})).commands
 CARTPOLE = {"task": "cartpole", "network": {"hidden_size": 8}, "physics": PHYSICS}
 
 
@@ -123,46 +122,6 @@ def test_the_memory_is_kept_from_step_to_step(policy, monkeypatch):
         player.step()
     observation, is_first, action = (np.stack(parts, axis=1) for parts in zip(*seen, strict=True))
     np.testing.assert_allclose(action, expected(observation, is_first), atol=1e-5)
-
-
-def test_intervals_by_hand():
-    # 2.5 +- 1.96 * sqrt(5/3) / sqrt(4); what is not a number does not count.
-    found = statistics.mean_interval(np.array([1.0, np.nan, 2.0, 3.0, 4.0, np.inf]))
-    np.testing.assert_allclose([found["mean"], found["low"], found["high"]], [2.5, 1.234826, 3.765174], atol=1e-6)
-    assert statistics.mean_interval(np.array([3.0])) == {"mean": 3.0, "low": 3.0, "high": 3.0}
-    assert statistics.mean_interval(np.array([np.nan])) == {"mean": None, "low": None, "high": None}
-
-
-@pytest.mark.parametrize(
-    ("hits", "of", "low", "high"),
-    [
-        (8, 10, 0.490157, 0.943319),  # (0.8 + 0.19208 -+ 1.96 sqrt(0.016 + 0.009604)) / 1.38416
-        (0, 10, 0.0, 0.277540),
-        (10, 10, 0.722460, 1.0),
-        (50, 100, 0.403830, 0.596170),
-    ],
-)
-def test_wilson_intervals_by_hand(hits, of, low, high):
-    found = statistics.share_interval(np.arange(of) < hits)
-    np.testing.assert_allclose([found["mean"], found["low"], found["high"]], [hits / of, low, high], atol=1e-6)
-    assert statistics.share_interval(np.zeros(0, bool)) == {"mean": None, "low": None, "high": None}
-
-
-def test_a_speed_error_does_not_cancel_between_commands():
-    nan = np.nan
-    command = [[1, 1, 1, 1, 2, 2], [1, 1, 1, nan, nan, nan], [1, nan, nan, nan, nan, nan]]  # the last two fall
-    speed = [[0, 1, 1.2, 1.1, 0, 1.6], [0, 1, 1.3, nan, nan, nan], [0, nan, nan, nan, nan, nan]]
-    still = np.where(np.isfinite(np.transpose(command)), 0.0, nan)
-    column = {"forward_command": np.transpose(command), "forward_speed": np.transpose(speed)}
-    column |= {"lateral_command": still, "lateral_speed": still}
-    speeds = statistics.settled_errors(column, COMMANDS, env_step_s=statistics.SETTLE_S)
-    np.testing.assert_allclose(speeds["forward_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
-    np.testing.assert_allclose(speeds["forward_speed"], [1.225, 1.15, nan])
-    np.testing.assert_allclose(speeds["lateral_speed_error"], [0.0, 0.0, nan])
-    swapped = {"forward_command": still, "forward_speed": still}
-    swapped |= {"lateral_command": column["forward_command"], "lateral_speed": column["forward_speed"]}
-    speeds = statistics.settled_errors(swapped, COMMANDS, env_step_s=statistics.SETTLE_S)
-    np.testing.assert_allclose(speeds["lateral_speed_error"], [(3 * 0.1 + 0.4) / 4, 0.15, nan])
 
 
 def test_the_command_writes_its_summary(policy, tmp_path, capsys):

@@ -83,6 +83,12 @@ def test_masked_statistics_against_numpy() -> None:
     assert not standardized[~mask].any()
 
 
+def test_almost_equal_advantages_are_not_blown_up() -> None:
+    # The standard deviation is 1e-8, and so is what is added to it: the rounding of equal numbers stays small.
+    tiny = jnp.asarray([[1e-8, -1e-8]])
+    np.testing.assert_allclose(returns.masked_standardize(tiny, jnp.ones((1, 2), bool)), [[0.5, -0.5]], rtol=1e-5)
+
+
 @pytest.mark.parametrize("helper", [returns.masked_mean, returns.masked_variance])
 def test_masked_statistics_of_nothing_are_zero(helper: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
     assert float(helper(jnp.full((2, 2), 5.0), jnp.zeros((2, 2), bool))) == 0.0

@@ -50,6 +50,49 @@ def test_default_names_are_never_shared(tmp_path: Path, monkeypatch: pytest.Monk
         assert all(run.path.match("runs/cassie-20*-*") for run in (first, second))
 
 
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.jsonl", "checkpoints", "tensorboard", "run.lock"])
+def test_links_that_lead_out_of_a_run_are_not_followed(tmp_path: Path, name: str) -> None:
+    config, outside = config_for(tmp_path / "run"), tmp_path / "outside"
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(outside)
+    complaint = rf"^{tmp_path}/run/{name}: a link that leads out of the run, to {outside}; put what it names here$"
+    with pytest.raises(RunError, match=complaint), open_run(config, resume=False):
+        pass
+    assert not outside.exists()
+    (tmp_path / "run" / name).unlink()
+    with open_run(config, resume=False):
+        pass
+    (tmp_path / "run" / name).rename(outside)
+    (tmp_path / "run" / name).symlink_to(outside)
+    with pytest.raises(RunError, match=complaint), open_run(config, resume=True):
+        pass
+    with pytest.raises(RunError, match=complaint):
+        load_run_config(tmp_path / "run")
+
+
+def test_a_link_to_a_whole_run_is_that_run(tmp_path: Path) -> None:
+    with open_run(config_for(tmp_path / "run"), resume=False):
+        pass
+    (tmp_path / "newest").symlink_to(tmp_path / "run")
+    assert load_run_config(tmp_path / "newest").collect.num_workers == 3
+    with open_run(config_for(tmp_path / "newest"), resume=True):
+        pass
+
+
+@pytest.mark.parametrize(("private", "others"), [(True, 0), (False, 0o55)])
+def test_a_private_run_is_open_to_its_owner_alone(
+    tmp_path: Path, private: bool, others: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = os.umask(0o022)
+    try:
+        for run_dir in ("", "named"):
+            with open_run(from_dict({"run_dir": run_dir, "private": private}), resume=False) as run:
+                assert run.path.stat().st_mode & 0o777 == 0o700 | others
+    finally:
+        os.umask(before)
+
+
 def test_refuses_a_second_run_in_the_same_directory(tmp_path: Path) -> None:
     config = config_for(tmp_path)
     with open_run(config, resume=False):

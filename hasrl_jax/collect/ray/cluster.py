@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import warnings
+from pathlib import Path
 from typing import Any
 
 from hasrl_jax.config.schema import RayConfig
@@ -15,6 +16,7 @@ from hasrl_jax.errors import ConfigError, WorkerError
 from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
 
 ANSWER_TIMEOUT_S = 10.0
+TOKEN_FILE = Path("~/.ray/auth_token")  # where Ray looks for it
 SPARE_BYTES = 2**27  # of the object store, beyond the data of two iterations
 
 
@@ -28,9 +30,11 @@ def import_ray(settings: RayConfig) -> Any:
     """The module, told before it is loaded to keep to itself.
 
     Raises:
-      ConfigError: it is not installed.
+      ConfigError: it is not installed, or there is no token for a cluster that is joined.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if settings.address:
+        _require_token(settings.address)
     if not settings.address and "ray" not in sys.modules:
         # Read when Ray is loaded: its servers listen on the loopback interface only, as they do on other systems ...
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
@@ -43,6 +47,22 @@ def import_ray(settings: RayConfig) -> Any:
         advice = 'pip install "ray>=2.52", or another backend'
         raise ConfigError(f"backend: ray cannot be loaded ({error}); expected {advice}") from None
     return ray
+
+
+def _require_token(address: str) -> None:
+    """Whoever reaches the ports of a cluster without a token can run any code on it, and on those who join it.
+
+    Raises:
+      ConfigError: there is no token, and RAY_AUTH_MODE does not say that there need be none.
+    """
+    if os.environ.setdefault("RAY_AUTH_MODE", "token") != "token":
+        return
+    given = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
+    if not given and not TOKEN_FILE.expanduser().is_file():
+        raise ConfigError(
+            f"ray.address: {address} is joined with its token; expected it in {TOKEN_FILE} or RAY_AUTH_TOKEN, or "
+            "RAY_AUTH_MODE=disabled for a cluster without one"
+        )
 
 
 def connect(ray: Any, settings: RayConfig, num_workers: int, bytes_per_worker: int) -> bool:
