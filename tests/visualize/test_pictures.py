@@ -86,7 +86,7 @@ def test_the_command_writes_a_small_picture(name: str, tmp_path: Path, monkeypat
     monkeypatch.setattr(gait, "record", lambda *_: _walk(280))
     assert pictures.main([name, "--policy", str(path), "--physics", "training", "--out", str(out)]) == 0
     with Image.open(out) as picture:
-    assert Image.open(out).width == (1210 if name in ("course", "commands") else 935)
+        assert picture.width == (1210 if name in ("course", "commands") else 935)
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 8
     assert out.stat().st_size < 150_000
 
