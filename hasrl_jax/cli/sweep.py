@@ -171,7 +171,7 @@ def read_space(path: Path) -> Space:
         )
     found: Space = {}
     for name, given in space.items():
-        entry = given if isinstance(given, dict) and len(given) == 1 else {"": None}
+        entry: dict[str, Any] = given if isinstance(given, dict) and len(given) == 1 else {"": None}
         ((kind, values),) = entry.items()
         fits = isinstance(values, list) and bool(values)
         if fits and kind != "choice":
