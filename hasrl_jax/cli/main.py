@@ -16,10 +16,12 @@ PROGRAMS = {
     "viewer": ("hasrl_jax.cli.viewer", "watch and steer a policy in the browser or in MuJoCo's window"),
     "export": ("hasrl_jax.cli.export", "write a policy to one file: NumPy arrays, ONNX or StableHLO"),
     "figures": ("hasrl_jax.cli.figures", "curves of runs: learning curve, the paper's figures 3 and 4"),
+    "sweep": ("hasrl_jax.cli.sweep", "train many times with settings that Optuna proposes"),
     "runs": ("hasrl_jax.cli.runs", "list runs and how far they have come"),
     "compare": ("hasrl_jax.cli.compare", "several runs side by side on one page: curves, settings, scorecards"),
     "pictures": ("hasrl_jax.cli.pictures", "how a policy walks: contacts, reward terms"),
     "bench": ("hasrl_jax.cli.bench", "timed figures: collector, learner, scaling, peers, parity"),
+    "completion": ("hasrl_jax.cli.completion", "what makes bash or zsh complete programs and options"),
     "doctor": ("hasrl_jax.cli.doctor", "what this machine has and lacks"),
 }
 

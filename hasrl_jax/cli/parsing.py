@@ -177,18 +177,18 @@ def _expand(argument: str) -> str:
     return SHORTHAND.get(option_name(argument), name) + equals + value
 
 
-def _options(settings: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+def options_of_fields(settings: dict[str, Any], prefix: str = "--") -> Iterator[str]:
     """The option of every config field."""
     for name, value in settings.items():
         option = prefix + name.replace("_", "-")
         if isinstance(value, dict):
-            yield from _options(value, option + ".")
+            yield from options_of_fields(value, option + ".")
         else:
             yield option
 
 
 def _refuse_unknown_options(arguments: list[str], base: Config) -> None:
-    known = [*_options(to_dict(base)), "--config", "--resume", "--init-policy"]
+    known = [*options_of_fields(to_dict(base)), "--config", "--resume", "--init-policy"]
     for argument in arguments:
         option = option_name(argument)
         if option.startswith("--") and option not in {*known, "--help"}:

@@ -13,12 +13,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.live import Live
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
 from hasrl_jax.errors import RunError
+from hasrl_jax.runs import dashboard
 from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY
 
 log = logging.getLogger("hasrl_jax")
@@ -109,7 +110,7 @@ def tag(name: str) -> str:
 
 
 class ProgressPrinter:
-    """One compact line per iteration; on a terminal also a bar with the time left.
+    """One compact line per iteration; on a terminal also the `dashboard` below them.
 
     Args:
       total_env_steps: environment steps at which the run ends.
@@ -119,15 +120,15 @@ class ProgressPrinter:
     def __init__(self, total_env_steps: int, start_env_steps: int = 0) -> None:
         self._total = total_env_steps
         self._history = deque([(time.monotonic(), start_env_steps)], maxlen=_RATE_WINDOW + 1)
-        self._bar: Progress | None = None
+        self._live: Live | None = None
+        self._shown = dashboard.History()
+        self._film = ""
         self._lost = False  # nothing can be shown any more
         if sys.stdout is not None and sys.stdout.isatty():
-            columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}")
             # Without a refresh thread, messages of the log are never overwritten in the middle.
-            self._bar = Progress(*columns, console=Console(file=sys.stdout, highlight=False), auto_refresh=False)
-            self._task = self._bar.add_task("", total=total_env_steps, completed=start_env_steps, left="")
-            self._bar.start()
-            self._bar.console.show_cursor(True)  # a run that is killed must not leave the terminal without one
+            self._live = Live(console=Console(file=sys.stdout, highlight=False), auto_refresh=False)
+            self._live.start()
+            self._live.console.show_cursor(True)  # a run that is killed must not leave the terminal without one
 
     def __enter__(self) -> "ProgressPrinter":
         return self
@@ -142,18 +143,23 @@ class ProgressPrinter:
         left = f"{_clock(self._seconds_left())} left"
         line = progress_line(record)
         with self._whatever_becomes_of_it():
-            if self._bar is None:
+            if self._live is None:
                 print(f"{line} | {left}", flush=True)
                 return
-            self._bar.console.print(line, soft_wrap=True, markup=False)
-            self._bar.update(self._task, completed=min(env_steps, self._total), left=left)
-            self._bar.refresh()
+            self._shown.add(record)
+            self._live.console.print(line, soft_wrap=True, markup=False)
+            now = dashboard.machine()
+            self._live.update(dashboard.view(record, self._shown, now, self._film, self._total, left), refresh=True)
+
+    def attach(self, name: str, path: Path) -> None:
+        """A film that was made is named from now on."""
+        self._film = str(path)
 
     def close(self) -> None:
         """Gives the terminal back."""
-        if self._bar is not None:
+        if self._live is not None:
             with self._whatever_becomes_of_it():
-                self._bar.stop()
+                self._live.stop()
 
     @contextlib.contextmanager
     def _whatever_becomes_of_it(self) -> Iterator[None]:
@@ -163,7 +169,7 @@ class ProgressPrinter:
         except (OSError, ValueError) as error:  # ValueError: the stream was closed
             if not self._lost:
                 log.warning("the progress cannot be shown (%s); training goes on, and metrics.jsonl has it all", error)
-            self._lost, self._bar = True, None
+            self._lost, self._live = True, None
 
     def _seconds_left(self) -> float | None:
         (first_time, first_steps), (last_time, last_steps) = self._history[0], self._history[-1]

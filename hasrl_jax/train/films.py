@@ -27,11 +27,11 @@ class Filmer:
 
     Args:
       run: the run directory; films are written to films/ in it.
-      done: given the name and the path of every film.
+      done: each is given the name and the path of every film.
       enabled: False films nothing: another process of the run does.
     """
 
-    def __init__(self, run: Path, done: Callable[[str, Path], None], enabled: bool = True):
+    def __init__(self, run: Path, done: list[Callable[[str, Path], None]], enabled: bool = True):
         self._folder, self._done, self._failed = run / FILMS_DIRECTORY, done, not enabled
         self._process: subprocess.Popen[bytes] | None = None
         self._path = Path()
@@ -86,7 +86,8 @@ class Filmer:
             return
         for leftover in (output, self._path.with_suffix(".npz")):
             leftover.unlink(missing_ok=True)
-        self._done("film", self._path)
+        for give in self._done:
+            give("film", self._path)
 
     def _command(self, config: Config, policy: Path) -> list[str]:
         video = config.video

@@ -108,7 +108,7 @@ def _run(parts: list[Part], state: RunState, run: RunDirectory, resume: bool, st
         MetricsWriter(run.path, state.progress.iteration) if reports else NullLogger() as writer,
         ProgressPrinter(config.total_env_steps, state.progress.env_steps) if reports else NullLogger() as printer,
         Trackers(config, run.path) if reports else NullLogger() as trackers,
-        Filmer(run.path, trackers.attach, reports) as filmer,
+        Filmer(run.path, [trackers.attach, printer.attach], reports) as filmer,
     ):
         trackers.attach("config", run.path / CONFIG_FILE)
         state = run_iterations(parts, state, run, stop, [writer.write, trackers.write, printer.update], filmer)
