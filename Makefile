@@ -38,7 +38,7 @@ wheel:  ## wheel and sdist in dist/, checked, installed in an empty environment 
 	$(BIN)/python tools/try_wheel.py dist
 
 COMPILE := uv pip compile --universal --python-version 3.11 --no-header --no-annotate pyproject.toml
-EXTRAS := $(foreach name,cuda deploy dev docs mutation ray release viewer,--extra $(name))
+EXTRAS := $(foreach name,cuda deploy dev docs menagerie mutation ray release viewer,--extra $(name))
 
 lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
 	$(BIN)/pip install uv

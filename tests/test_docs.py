@@ -18,7 +18,8 @@ import reference
 PACKAGE = Path(hasrl_jax.__file__).parent
 ROOT = PACKAGE.parent
 DOCUMENTS = (
-    *("docs/architecture.md", "docs/paper_to_code.md", "docs/reliability.md", "CONTRIBUTING.md", "README.md"),
+    *("docs/architecture.md", "docs/deploy.md", "docs/paper_to_code.md", "docs/reliability.md"),
+    *("CONTRIBUTING.md", "README.md"),
     *(f"docs/{name}.md" for name in ("index", "start", "install", "concepts", "howto", "troubleshooting", "faq")),
     *(f"docs/tutorials/{name}.md" for name in ("play", "train", "task")),
     *(f"docs/policies/{name}.md" for name in ("index", "released", "released-steer", "released-stairs")),

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
-from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run, to_play
+from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options, require_writable
+from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, robot_of, run, to_play
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config, EvaluateConfig
@@ -34,7 +34,8 @@ def evaluate(arguments: list[str]) -> None:
         _write_scorecard(known, rest, arguments)
         return
     config, parameters = policy_to_play(known, rest, "evaluate")
-    task = make_task_on(config, known.model, known.mapping) if known.model else make_task(config)
+    robot = robot_of(known)
+    task = make_task_on(config, robot) if robot else make_task(config)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )
@@ -50,8 +51,9 @@ def _write_scorecard(known: argparse.Namespace, rest: list[str], arguments: list
     scorecard.refuse_settings(rest)
     trained, parameters = load_policy_parameters(known.run_dir, known.policy)
     command = " ".join(["python -m hasrl_jax.evaluate", *arguments])
-    if known.model:
-        config, robot = to_play(trained, known.physics, rest, "evaluate"), scorecard.Robot(known.model, known.mapping)
+    robot = robot_of(known)
+    if robot:
+        config = to_play(trained, known.physics, rest, "evaluate")
         scorecard.write_on_model(known.scorecard, robot, config, parameters, known.seed, command)
         return
     source = known.run_dir or known.policy or "released"
@@ -87,11 +89,8 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument(
         "--against", nargs="*", default=[], help='more policies for the scorecard: "zero", "random", run directories'
     )
-    parser.add_argument("--model", type=Path, help="play on this MJCF file of the same robot, see docs/deploy.md")
-    parser.add_argument("--mapping", type=Path, help="YAML file of the names that differ in --model")
+    add_model_options(parser)
     known, rest = parser.parse_known_args(arguments)
-    if known.mapping and not known.model:
-        raise ConfigError("--mapping: names of a --model; give that too")
     check_number("--episodes", known.episodes, limits_of(EvaluateConfig, "episodes"))
     check_number("--seed", known.seed, limits_of(Config, "seed"))
     if known.seconds is None:

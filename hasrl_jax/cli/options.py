@@ -27,6 +27,14 @@ def add_policy_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
 
 
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """The options of the programs that can play on another model of a robot, see `parsing.robot_of`."""
+    parser.add_argument(
+        "--model", type=Path, help="play on this MJCF file of the same robot, or on menagerie, see docs/deploy.md"
+    )
+    parser.add_argument("--mapping", type=Path, help="YAML file of the names that differ in --model")
+
+
 def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 

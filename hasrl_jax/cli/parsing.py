@@ -22,6 +22,7 @@ from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.registry import Robot
 from hasrl_jax.errors import ConfigError, HasrlError
 from hasrl_jax.policy.loading import load_policy_parameters, under_reference_physics
 from hasrl_jax.policy.numpy_networks import Parameters
@@ -120,6 +121,17 @@ def policy_to_play(known: argparse.Namespace, overrides: list[str], program: str
     """
     trained, parameters = load_policy_parameters(known.run_dir, known.policy)
     return to_play(trained, known.physics, overrides, program), parameters
+
+
+def robot_of(known: argparse.Namespace) -> Robot | None:
+    """The other model that `options.add_model_options` names.
+
+    Raises:
+      ConfigError: names without a model.
+    """
+    if known.mapping and not known.model:
+        raise ConfigError("--mapping: names of a --model; give that too")
+    return Robot(known.model, known.mapping) if known.model else None
 
 
 def run(job: Callable[[], None]) -> int:

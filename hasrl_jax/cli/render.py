@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hasrl_jax.cli.options import OneLineParser, add_policy_options, require_writable
+from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options, require_writable
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize import course, opengl
 from hasrl_jax.visualize.render import SHADOW_PX, Commands, Push, film, play
@@ -26,7 +26,7 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
     """
-    from hasrl_jax.cli.parsing import override_for_policy, policy_to_play
+    from hasrl_jax.cli.parsing import override_for_policy, policy_to_play, robot_of
     from hasrl_jax.config import tasks
     from hasrl_jax.config.convert import from_dict
     from hasrl_jax.envs.gymnasium import TaskEnv
@@ -40,7 +40,7 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     config = tasks.find(config.task).undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
     config = override_for_policy(config, rest, "render")
     strip, commands = _strip(known), _commands(known)
-    env = TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX)
+    env = TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX, robot_of(known))
     try:
         if known.push and env.task.with_push is None:
             raise ConfigError(f"--push: the robot of task {config.task} cannot be pushed; leave it out")
@@ -108,6 +108,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         allow_abbrev=False,
     )
     add_policy_options(parser)
+    add_model_options(parser)
     parser.add_argument("--out", type=Path, default=Path("policy.mp4"), help="the video")
     parser.add_argument("--strip", type=Path, help="a row of frames as one PNG; default: beside the video")
     parser.add_argument("--seconds", type=float, default=10.0)

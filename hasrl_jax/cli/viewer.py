@@ -5,8 +5,8 @@ import sys
 import time
 from collections.abc import Callable
 
-from hasrl_jax.cli.options import OneLineParser, add_policy_options
-from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run
+from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options
+from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, robot_of, run
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config
@@ -36,7 +36,7 @@ def view(arguments: list[str], opened: Callable[[str], object] | None = None) ->
         browser.require_viser()
         browser.free_port(known.port, known.host)
     config, parameters = policy_to_play(known, rest, "viewer")
-    live = Live(config, parameters, known.seed, known.randomized)
+    live = Live(config, parameters, known.seed, known.randomized, robot_of(known))
     if known.native:
         native.show(live, known.randomized)
         return
@@ -69,6 +69,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         allow_abbrev=False,
     )
     add_policy_options(parser)
+    add_model_options(parser)
     parser.add_argument("--randomized", action="store_true", help="begin with a randomised robot")
     parser.add_argument("--port", type=int, default=8080, help="of the page; 0 takes a free one")
     hosts = f"address to listen on; {browser.ANY_HOST}: all of this machine, for those who have the token"

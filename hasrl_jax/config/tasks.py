@@ -37,6 +37,7 @@ class TaskSpec:
     randomized: Callable[[Config], Config] | None = None
     # The task on another MJCF file of its robot, with names of ours mapped to names there; None where it cannot be.
     make_on: Callable[[Config, Path, Mapping[str, Any]], Any] | None = None
+    menagerie: str = ""  # name of that robot in MuJoCo Menagerie
 
 
 def find(name: str) -> TaskSpec:

@@ -19,7 +19,7 @@ from hasrl_jax.config.limits import Limits, check_number
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.registration import register
-from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.registry import Robot, make_task, make_task_on
 from hasrl_jax.envs.scene import Scene, camera_of, place_ground
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import ConfigError
@@ -56,6 +56,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
       height: of rendered frames, pixels.
       camera: name of a camera of the model; default `track`, or the first one.
       shadow_px: side of the shadow map; None keeps the model's.
+      robot: another model of the robot; None is the task's own.
 
     Raises:
       ConfigError: impossible configuration values, or no such camera.
@@ -71,7 +72,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         height: int = 480,
         camera: str | None = None,
         shadow_px: int | None = None,
+        robot: Robot | None = None,
     ):
+        self._robot = robot
         self.config = recipe("cassie") if config is None else config
         check(self.config)
         self.render_mode = known_render_mode(render_mode)
@@ -233,7 +236,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _open(self) -> None:
         """Makes the task and the engine that runs it."""
-        self.task: Task = make_task(self.config)
+        self.task: Task = make_task(self.config) if self._robot is None else make_task_on(self.config, self._robot)
         self._envs = self._engine()
         self._info_names = info_names(self.task)
 

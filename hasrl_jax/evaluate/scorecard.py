@@ -20,7 +20,7 @@ import numpy as np
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
-from hasrl_jax.envs.registry import make_task, make_task_on
+from hasrl_jax.envs.registry import Robot, make_task, make_task_on
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
 from hasrl_jax.evaluate.page import percent, write_page
@@ -117,18 +117,6 @@ class Row(NamedTuple):
         if self.disturbance:
             speed += f", {self.disturbance}"
         return f"{speed}, {self.push_n:g} N push" if self.push_n else speed
-
-
-class Robot(NamedTuple):
-    """Another MJCF file of the robot to play on, as `make_task_on` takes it."""
-
-    file: Path
-    mapping: Path | None = None
-
-    @property
-    def label(self) -> str:
-        """The file with its folder: most are called alike."""
-        return "/".join(self.file.absolute().parts[-2:])
 
 
 def model_rows() -> list[Row]:
@@ -291,7 +279,7 @@ def write_on_model(
     report = _read(path)
     if not report.get("policies"):
         raise ConfigError(f"--scorecard: {path} holds no scorecard; expected one made without --model")
-    make_task_on(row_config(config, model_rows()[0], SHORT_S), *robot)  # complains before the work
+    make_task_on(row_config(config, model_rows()[0], SHORT_S), robot)  # complains before the work
     entry: dict[str, Any] = {
         "policy_digest": _digest(config, parameters, report["seconds"]),
         "command": command,
@@ -377,7 +365,7 @@ def measure(
 def _play(job: tuple[Row, Config, Parameters, int, list[int], Robot | None]) -> dict[str, np.ndarray]:
     """Per-episode figures of a part of a row, each [N]."""
     _, config, parameters, episodes, seed, robot = job
-    task = make_task(config) if robot is None else make_task_on(config, *robot)
+    task = make_task(config) if robot is None else make_task_on(config, robot)
     cap_s = config.collect.max_episode_steps * config.physics.env_step_s
     played = run_episodes(config, task, parameters, episodes, seed, seconds=cap_s)
     column = columns(played, task)

@@ -1,5 +1,8 @@
 """The task on another MJCF file of the robot: the same physics under other names is the same task."""
 
+import pickle
+import sys
+import types
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,8 +16,11 @@ from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.cassie import other_model
 from hasrl_jax.envs.cassie.task import ASSET
 from hasrl_jax.envs.cpu_engine import CpuEnvs
-from hasrl_jax.envs.registry import make_task, make_task_on
+from hasrl_jax.envs.gymnasium import TaskEnv
+from hasrl_jax.envs.registry import MENAGERIE, Robot, make_task, make_task_on
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.policy.loading import load_baseline
+from hasrl_jax.visualize.viewer.live import Live
 
 RENAMED = {
     "joints": {"left-knee": "KneeL", "right-achilles-rod": "RodR"},
@@ -83,7 +89,7 @@ def test_the_same_robot_under_other_names_moves_alike(tmp_path, randomized):
     changes = {"cassie": {"randomize": {"enabled": randomized, "mass_scale": [1, 1]}, "push": {"force_n": [50, 50]}}}
     config = from_dict(changes, shipped("paper"))
     ours = make_task(config)
-    theirs = make_task_on(config, other_file(tmp_path), mapping_file(tmp_path, RENAMED))
+    theirs = make_task_on(config, Robot(other_file(tmp_path), mapping_file(tmp_path, RENAMED)))
     assert theirs.model.nq == ours.model.nq + 1
     assert theirs.model.nu == 10
     assert theirs.model.nsensor == ours.model.nsensor
@@ -125,7 +131,7 @@ class _Given:
 
 
 def test_joints_start_in_our_pose_wherever_they_stand(tmp_path):
-    task = make_task_on(shipped("cassie_walk"), other_file(tmp_path), mapping_file(tmp_path, RENAMED))
+    task = make_task_on(shipped("cassie_walk"), Robot(other_file(tmp_path), mapping_file(tmp_path, RENAMED)))
     pose, model = task.model.key("stand").qpos, task.model
     assert pose[model.joint("KneeL").qposadr[0]] == pytest.approx(-1.1997)
     assert pose[model.joint("right-foot").qposadr[0]] == pytest.approx(-1.5968)
@@ -148,29 +154,29 @@ def test_joints_start_in_our_pose_wherever_they_stand(tmp_path):
 )
 def test_what_is_missing_is_named(tmp_path, mapping, complaint):
     with pytest.raises(ConfigError, match=complaint):
-        make_task_on(shipped("cassie_walk"), other_file(tmp_path), mapping_file(tmp_path, mapping))
+        make_task_on(shipped("cassie_walk"), Robot(other_file(tmp_path), mapping_file(tmp_path, mapping)))
 
 
 def test_files_that_cannot_be_played_on_are_refused(tmp_path):
     config, mapping = shipped("cassie_walk"), mapping_file(tmp_path, RENAMED)
     with pytest.raises(ConfigError, match="it has no ground; expected a scene with a floor"):
-        make_task_on(config, other_file(tmp_path, floor=False), mapping)
+        make_task_on(config, Robot(other_file(tmp_path, floor=False), mapping))
     without = {**RENAMED, "sensors": {}}
-    assert make_task_on(config, other_file(tmp_path, accelerometer=False), mapping_file(tmp_path, without))
+    assert make_task_on(config, Robot(other_file(tmp_path, accelerometer=False), mapping_file(tmp_path, without)))
     stairs = from_dict({"cassie": {"terrain": {"kind": "steps"}}}, config)
     with pytest.raises(ConfigError, match=r"cassie.terrain.kind: got steps; expected flat with a --model"):
-        make_task_on(stairs, other_file(tmp_path), mapping)
+        make_task_on(stairs, Robot(other_file(tmp_path), mapping))
     with pytest.raises(ConfigError, match="there is no such file"):
-        make_task_on(config, tmp_path / "nothing.xml")
+        make_task_on(config, Robot(tmp_path / "nothing.xml"))
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody>")
     with pytest.raises(ConfigError, match="not an MJCF file that compiles"):
-        make_task_on(config, broken)
+        make_task_on(config, Robot(broken))
     with pytest.raises(ConfigError, match="a policy for task cartpole is played on its own model only"):
-        make_task_on(shipped("cartpole"), broken)
+        make_task_on(shipped("cartpole"), Robot(broken))
     (tmp_path / "list.yaml").write_text("[joints]\n")
     with pytest.raises(ConfigError, match="holds list; expected groups of names"):
-        make_task_on(config, other_file(tmp_path), tmp_path / "list.yaml")
+        make_task_on(config, Robot(other_file(tmp_path), tmp_path / "list.yaml"))
 
 
 def test_a_pelvis_that_does_not_come_first_is_refused(tmp_path):
@@ -185,7 +191,7 @@ def test_a_pelvis_that_does_not_come_first_is_refused(tmp_path):
     with pytest.raises(
         ConfigError, match=r"its first joints are \['mjJNT_SLIDE', 'mjJNT_FREE'\]; expected a free pelvis"
     ):
-        make_task_on(shipped("cassie_walk"), path, mapping_file(tmp_path, RENAMED))
+        make_task_on(shipped("cassie_walk"), Robot(path, mapping_file(tmp_path, RENAMED)))
 
 
 def test_defaults_of_the_other_file_do_not_reach_our_actuators(tmp_path):
@@ -194,7 +200,7 @@ def test_defaults_of_the_other_file_do_not_reach_our_actuators(tmp_path):
     defaults = tree.getroot().find("default")
     ElementTree.SubElement(defaults, "general", ctrllimited="true", ctrlrange="-0.1 0.1", gear="3")
     tree.write(path)
-    model = make_task_on(shipped("cassie_walk"), path, mapping_file(tmp_path, RENAMED)).model
+    model = make_task_on(shipped("cassie_walk"), Robot(path, mapping_file(tmp_path, RENAMED))).model
     assert not model.actuator_ctrllimited.any()
     np.testing.assert_array_equal(model.actuator_gear[:, 0], 1)
     ours = make_task(shipped("cassie_walk")).model
@@ -215,3 +221,38 @@ def test_the_command_line_plays_the_released_policy_on_it(tmp_path, capsys):
 
 def test_names_that_are_not_mapped_are_ours():
     assert other_model.names_from({}, ASSET) == other_model.Names()
+
+
+def test_the_environment_that_pictures_are_taken_of_and_its_copies_have_the_other_model(tmp_path):
+    robot = Robot(other_file(tmp_path), mapping_file(tmp_path, RENAMED))
+    env = TaskEnv(shipped("cassie_walk"), robot=robot)
+    for one in (env, pickle.loads(pickle.dumps(env))):
+        one.reset(seed=0)
+        _, reward, terminated, _, _ = one.step(np.zeros(10, np.float32))
+        assert one.task.model.nq == 36 and reward > 0 and not terminated
+    live = Live(shipped("cassie_walk"), load_baseline("zero", shipped("cassie_walk"))[1], 0, robot=robot)
+    assert live.model.nq == 36
+
+
+def _menagerie(monkeypatch, found):
+    """A package `mujoco_menagerie` whose robots are what `found` returns or raises."""
+    package = types.SimpleNamespace(MenagerieError=RuntimeError, get=lambda name: types.SimpleNamespace(xml=found))
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", package)
+
+
+def test_the_menagerie_gives_its_file_or_says_why_not(monkeypatch, tmp_path):
+    config, robot = shipped("cassie_walk"), Robot(MENAGERIE, mapping_file(tmp_path, RENAMED))
+    assert (robot.label, Robot(tmp_path / "robot.xml").label) == ("MuJoCo Menagerie", f"{tmp_path.name}/robot.xml")
+    path = other_file(tmp_path)
+    _menagerie(monkeypatch, lambda: path)
+    assert make_task_on(config, robot).asset == path
+
+    def closed():
+        raise RuntimeError("no\nnetwork")
+
+    _menagerie(monkeypatch, closed)
+    with pytest.raises(ConfigError, match=r"agility_cassie cannot be loaded \(no network\); give a file"):
+        make_task_on(config, robot)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
+    with pytest.raises(ConfigError, match=r'needs pip install "hasrl_jax\[menagerie\]"'):
+        make_task_on(config, robot)

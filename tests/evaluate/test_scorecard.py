@@ -11,6 +11,7 @@ from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.cassie.commands import PUSH_UNIFORMS, draw_push, next_push
+from hasrl_jax.envs.cassie.task import ASSET
 from hasrl_jax.evaluate import rollout, scorecard
 from hasrl_jax.evaluate.scorecard import Row
 from hasrl_jax.policy.loading import load_baseline
@@ -134,6 +135,42 @@ def test_a_small_scorecard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "| 1 m/s | 100 %" in page
     assert "### zero" in page
     assert (tmp_path / "scorecard.png").stat().st_size > 10_000
+
+
+def test_another_model_is_added_to_a_card_and_stays_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = [Row("speed", (0.0, 0.0))]
+    monkeypatch.setattr(scorecard, "rows", lambda _: few)
+    monkeypatch.setattr(
+        scorecard, "model_rows", lambda: [Row("speed", (1.0, 1.0)), Row("push", (1.0, 1.0), push_n=50.0)]
+    )
+    monkeypatch.setattr(scorecard, "MODEL_EPISODES", 2)
+    monkeypatch.setattr(scorecard, "SHORT_S", 4.0)
+    whole = ["--policy", "released", "--scorecard", str(tmp_path), "--physics", "training"]
+    card = [*whole, "--episodes", "2", "--seconds", "4"]
+    assert evaluate_main(card) == 0
+    before = json.loads((tmp_path / "scorecard.json").read_text())
+    other = tmp_path / "other" / "robot.xml"
+    other.parent.mkdir()
+    other.write_text(ASSET.read_text().replace('pos="0 0 -0.01" contype="0"', 'pos="0 0 0" contype="0"'))
+    assert evaluate_main([*whole, "--model", str(other)]) == 0
+    after = json.loads((tmp_path / "scorecard.json").read_text())
+    assert after["policies"] == before["policies"]
+    found = after["models"]["other/robot.xml"]
+    assert [row["episodes"] for row in found["rows"]] == [2, 2]
+    assert found["rows"][0]["share_up"]["mean"] == 1.0
+    assert 0.8 < found["rows"][0]["forward_speed"]["mean"] < 1.2
+    page = (tmp_path / "scorecard.md").read_text()
+    section = page[page.index("### other/robot.xml") :]
+    assert "| 1 m/s | 100 %" in section and "| 1 m/s | 100 % (34–100) |" in section[section.index("50 N") :]
+    assert evaluate_main(card) == 0  # what is there is not measured again
+    assert json.loads((tmp_path / "scorecard.json").read_text())["models"] == after["models"]
+
+
+def test_a_model_needs_a_card_to_be_added_to(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert evaluate_main(["--scorecard", str(tmp_path), "--model", str(ASSET)]) == 2
+    assert "holds no scorecard; expected one made without --model" in capsys.readouterr().err
+    assert evaluate_main(["--scorecard", str(tmp_path), "--model", str(ASSET), "--against", "zero"]) == 2
+    assert "--against: a scorecard compares policies on their own model" in capsys.readouterr().err
 
 
 def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

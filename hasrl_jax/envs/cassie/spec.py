@@ -63,6 +63,7 @@ SPEC = TaskSpec(
     name="cassie",
     make=make,
     make_on=make_on,
+    menagerie="agility_cassie",
     recipe=CONFIG_FOLDER / "cassie_walk.yaml",
     settings=CassieConfig,
     check=check,

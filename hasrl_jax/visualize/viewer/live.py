@@ -15,6 +15,7 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import CollectConfig, Config
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.model import load_model
+from hasrl_jax.envs.registry import Robot
 from hasrl_jax.envs.task import Command
 from hasrl_jax.evaluate.rollout import Player
 from hasrl_jax.policy.numpy_networks import Parameters
@@ -64,14 +65,17 @@ class Live:
       parameters: as `learn.ppo.export_parameters` returns them.
       seed: of the environments.
       randomized: the robot of the first episode, where the task has randomised ones.
+      robot: another model of the robot; None is the task's own.
     """
 
-    def __init__(self, config: Config, parameters: Parameters, seed: int, randomized: bool = False):
+    def __init__(
+        self, config: Config, parameters: Parameters, seed: int, randomized: bool = False, robot: Robot | None = None
+    ):
         spec, longest = tasks.find(config.task), int(limits_of(CollectConfig, "max_episode_steps").high)
         nominal = spec.undisturbed(from_dict({"collect": {"max_episode_steps": longest}}, config))
-        self._players = {False: Player(TaskEnv(nominal), parameters, seed)}
+        self._players = {False: Player(TaskEnv(nominal, robot=robot), parameters, seed)}
         if spec.randomized:
-            self._players[True] = Player(TaskEnv(spec.randomized(nominal)), parameters, seed)
+            self._players[True] = Player(TaskEnv(spec.randomized(nominal), robot=robot), parameters, seed)
         task = self._players[False].env.task
         self.commands: tuple[Command, ...] = task.commands
         self.can_push, self.can_randomize = task.with_push is not None, True in self._players
