@@ -21,7 +21,7 @@ DOCUMENTS = (
     *("docs/architecture.md", "docs/deploy.md", "docs/paper_to_code.md", "docs/reliability.md"),
     *("CONTRIBUTING.md", "README.md"),
     *(f"docs/{name}.md" for name in ("index", "start", "install", "concepts", "howto", "troubleshooting", "faq")),
-    *(f"docs/tutorials/{name}.md" for name in ("play", "train", "task")),
+    *(f"docs/tutorials/{name}.md" for name in ("play", "train")),
     *(f"docs/policies/{name}.md" for name in ("index", "released", "released-steer", "released-stairs")),
 )
 FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")

@@ -46,6 +46,7 @@ def pages() -> dict[str, str]:
         "reference/commands.md": command_lines(),
         "changelog.md": from_root("CHANGELOG.md"),
         "contributing.md": from_root("CONTRIBUTING.md"),
+        "security.md": from_root("SECURITY.md"),
         **modules(),
     }
 
@@ -279,7 +280,9 @@ def _help(module: str) -> str:
 
 def from_root(name: str) -> str:
     """A document of the repository's root, with links that hold inside docs/."""
-    return re.sub(r"\]\(docs/", "](", (ROOT / name).read_text(encoding="utf-8"))
+    text = (ROOT / name).read_text(encoding="utf-8")
+    text = re.sub(r"\]\((CHANGELOG|CONTRIBUTING|SECURITY)\.md", lambda link: f"]({link[1].lower()}.md", text)
+    return re.sub(r"\]\(docs/", "](", text)
 
 
 def policy_facts(name: str) -> str:

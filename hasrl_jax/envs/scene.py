@@ -48,7 +48,8 @@ class Scene:
     Args:
       task: whose model is drawn.
       physics: compiles the copy of the model that is drawn.
-      height, width: of a frame, pixels.
+      height: of a frame, pixels.
+      width: of a frame, pixels.
       camera: from `camera_of`.
       shadow_px: side of the shadow map; None keeps the model's.
 

@@ -54,7 +54,8 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       num_envs: E.
       autoreset_mode: `AutoresetMode.NEXT_STEP` or `AutoresetMode.SAME_STEP`, or their values.
       render_mode: None or "rgb_array".
-      width, height: of rendered frames, pixels.
+      width: of rendered frames, pixels.
+      height: of rendered frames, pixels.
       camera: name of a camera of the model; default `track`, or the first one.
 
     Raises:
