@@ -36,7 +36,10 @@ MODULES = {
     "learn/ppo": ([ORACLE, PPO], ""),
     "collect/buffer": (["tests/learn/test_batching.py", PROPERTIES], "pad or slots"),
     "envs/layout": (["tests/envs/test_layout.py", PROPERTIES], "layout or mirror"),
-    "envs/cassie/clock": (["tests/envs/test_clock.py", PROPERTIES], "clock"),
+    "envs/cassie/clock": (
+        ["tests/envs/test_clock.py", PROPERTIES, "tests/envs/test_heading_frame.py"],
+        "clock or both_feet",
+    ),
     "evaluate/statistics": (["tests/evaluate/test_statistics.py"], ""),
 }
 # One change of each kind where the tool would make ten: + to -, < to <=, a number to its neighbours, a negation away.

@@ -63,6 +63,11 @@ def test_cycle_and_swing_at_known_speeds() -> None:
     np.testing.assert_allclose(clock.swing_fraction(np.array([0.0, 3.0, 99.0]), CONFIG, np), [0.3, 0.7, 0.9])
 
 
+def test_a_foot_always_swings_a_little() -> None:
+    slower = ClockConfig(swing_fraction=0.3, swing_fraction_per_speed=-0.2)
+    np.testing.assert_allclose(clock.swing_fraction(np.array([1.0, 2.0, 4.0]), slower, np), [0.1, 0.05, 0.05])
+
+
 def test_the_cycle_can_stay_up_to_a_speed_and_quicken_above_it() -> None:
     config = ClockConfig(cycle_s=0.75, cycle_per_speed_s=-0.05, quicken_above_m_s=2.0)
     speed = np.array([0.0, 2.0, -2.0, 3.0, -4.0])

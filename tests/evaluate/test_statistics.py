@@ -67,12 +67,15 @@ def test_errors_of_a_command_weigh_as_long_as_it_was_held() -> None:
     # |1 - 3| + |2 + 2 + 2 - 1| over 6 steps; |-0.5| + |0.1| over 2.
     np.testing.assert_allclose(statistics.command_error(error, settled), [7 / 6, 0.3, np.nan])
     np.testing.assert_allclose(statistics.settled_mean(error, settled), [3 / 6, -0.2, np.nan])
+    once = np.array([[False, True, False]]).T
+    for compute in (statistics.command_error, statistics.settled_mean):
+        np.testing.assert_allclose(compute(np.array([[5.0, 7.0, 9.0]]).T, once), [7.0])  # a single step is enough
     assert statistics.command_error(np.zeros((0, 2)), np.zeros((0, 2), bool)).shape == (2,)
 
 
 def test_a_summary_by_hand() -> None:
     """Two episodes of the walking task: one to the cap, settled for its last two steps, and one that diverged."""
-    steps = round(statistics.SETTLE_S / TASK.env_step_s) + 2
+    steps = 120 + 2  # a command settles within 3 s of 25 ms each
     measures = np.zeros((steps, 2, len(TASK.measures)))
     place = TASK.measures.index
     measures[:, :, place("forward_command")] = 1.0

@@ -40,6 +40,13 @@ def test_pad_segments_of_an_empty_buffer_is_all_padding() -> None:
     assert not padded.mask.any()
 
 
+def test_a_segment_without_steps_is_a_row_of_padding() -> None:
+    padded = pad_segments(_flat(4, 2), [0, 2], [2, 2], max_length=3, rows=2)
+    assert padded.policy_version.tolist() == [1, 2]
+    assert not padded.mask[1].any() and not padded.reward[1].any()
+    assert padded.reward[0, :2].all()
+
+
 @pytest.mark.parametrize(
     ("starts", "ends", "rows", "message"),
     [([0, 1, 2], [1, 2, 3], 2, "rows"), ([0], [9], 2, "max_length"), ([8], [11], 2, "inside a buffer")],

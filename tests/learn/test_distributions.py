@@ -16,6 +16,7 @@ def test_density_integrates_to_one_and_gives_entropy() -> None:
     cell = (axis[1] - axis[0]) ** 2
     p = np.exp(log_p) * cell
     np.testing.assert_allclose(p.sum(), 1.0, rtol=1e-4)
+    np.testing.assert_allclose((p[..., None] * points).sum(axis=(0, 1)), MEAN, rtol=1e-3)
     np.testing.assert_allclose(distributions.entropy(LOG_STD), -(p * log_p).sum(), rtol=1e-4)
 
 
