@@ -76,7 +76,8 @@ def test_what_a_tracker_raises_is_said_once_and_ends_nothing(
 
     monkeypatch.setitem(trackers.MAKERS, "wandb", Fragile)
     monkeypatch.setitem(trackers.MAKERS, "mlflow", lambda *_: 1 / 0)
-    logging.getLogger("hasrl_jax").propagate = True
+    monkeypatch.setattr(logging.getLogger("hasrl_jax"), "handlers", [])
+    monkeypatch.setattr(logging.getLogger("hasrl_jax"), "propagate", True)
     with caplog.at_level(logging.WARNING, "hasrl_jax"), Trackers(tracked("wandb", "mlflow"), tmp_path) as both:
         both.write(RECORD)
         both.write(RECORD)

@@ -35,6 +35,7 @@ def test_the_page_is_opened(arguments: list[str], opened: bool, monkeypatch: pyt
 
 
 def test_an_unknown_policy_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("viser")
     assert main.main(["demo", "--policy", "nobody", "--no-open"]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "released-steer" in error
