@@ -31,7 +31,7 @@ RELEASED = {
 # Of the files; a digest inside a file finds damage, and this one a file that was put in its place.
 RELEASED_SHA256 = {
     "released": "a848c5a08b333bcc5d869a874a3b3bdbe69af6a580e4a3739e6c992f393d575f",
-    "released-steer": "c94f3aab97b1812a253b5bc1ee441bde4f83ddaec3674bfd9d8e1dd4f631bedc",
+    "released-steer": "46a840064f5ea73b65d25d8d87e1267deb120e56ca8efa43a0d11f97af03a8a8",
     "released-stairs": "a3c2a6994789537a3cf7b25fb903cdae07ff3e1bac6045af2fb8ea5631c23ce6",
 }
 
