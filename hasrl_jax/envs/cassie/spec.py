@@ -44,8 +44,9 @@ def check(config: Config) -> None:
 
 
 def undisturbed(config: Config) -> Config:
-    """`config` with the nominal robot, from rest, and no pushes but those that are asked for."""
-    still = {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}, "command": {"start_moving": 0.0}}
+    """`config` with the nominal robot, from rest, facing x, and no pushes but those that are asked for."""
+    command = {"start_moving": 0.0, "start_heading_rad": 0.0}
+    still = {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}, "command": command}
     return from_dict({"cassie": still}, config)
 
 
