@@ -52,7 +52,7 @@ def export(arguments: list[str]) -> None:
         )
     if known.model:
         config = cli.to_play(trained, known.physics, rest, "export")
-        model_file.write(known.model, make_task(config).asset, config.physics)
+        model_file.write(known.model, make_task(config), config.physics)
         print(f"{known.model}: {1 / config.physics.timestep_s:g} Hz physics")
 
 

@@ -103,9 +103,9 @@ def test_the_hash_tells_trainings_apart_but_not_their_folders():
 @pytest.mark.parametrize("recipe", ["cassie_walk", "cartpole"])
 def test_the_model_beside_a_policy_is_the_one_it_is_played_on(recipe, tmp_path):
     config = loading.under_reference_physics(shipped(recipe))
-    asset, path = make_task(config).asset, tmp_path / "model.xml"
-    model_file.write(path, asset, config.physics)
-    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), load_model(asset, config.physics, visual=True)
+    task, path = make_task(config), tmp_path / "model.xml"
+    model_file.write(path, task, config.physics)
+    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), load_model(task.asset, config.physics, visual=True)
     size = mujoco.mj_sizeModel(ours)
     assert mujoco.mj_sizeModel(theirs) == size
     images = []
@@ -116,8 +116,19 @@ def test_the_model_beside_a_policy_is_the_one_it_is_played_on(recipe, tmp_path):
     assert images[0] == images[1]
 
 
+def test_the_model_beside_a_policy_has_its_motors(tmp_path):
+    config = from_dict({"cassie": {"motor": {"torque_speed_curve": True}}}, shipped("cassie_steer"))
+    task, path = make_task(config), tmp_path / "model.xml"
+    model_file.write(path, task, config.physics)
+    written = mujoco.MjModel.from_xml_path(str(path))
+    for field in ("gainprm", "dynprm", "biasprm", "gaintype", "dyntype", "biastype", "ctrlspec", "forcerange"):
+        ours = getattr(task.model, f"actuator_{field}")
+        np.testing.assert_allclose(getattr(written, f"actuator_{field}"), ours, err_msg=field)
+
+
 def test_a_model_of_several_files_is_refused(tmp_path):
     asset = tmp_path / "meshes.xml"
     asset.write_text('<mujoco><asset><mesh name="m" file="m.obj"/></asset></mujoco>')
+    task = dataclasses.replace(make_task(shipped("cartpole")), asset=asset)
     with pytest.raises(ConfigError, match=r"meshes\.xml refers to m\.obj; expected a model in a single file"):
-        model_file.write(tmp_path / "out.xml", asset, shipped("cartpole").physics)
+        model_file.write(tmp_path / "out.xml", task, shipped("cartpole").physics)

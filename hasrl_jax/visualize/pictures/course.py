@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN = ("eight", "slalom", "joystick")
 ARROW_EVERY_S = 1.0
 WALKED, ASKED, FALLEN = "#1f6f8b", "#d9a05b", "#b91c1c"
 
@@ -39,8 +38,9 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.2), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(SHOWN)), SHOWN, strict=True):
-        draw_path(axes, name, walk(config, parameters, name, COURSES[name], seed))
+    panels = figure.subplot_mosaic([["eight", "slalom"], ["eight", "joystick"]], width_ratios=[1, 2.2])
+    for name, axes in panels.items():
+        draw_path(axes, str(name), walk(config, parameters, str(name), COURSES[str(name)], seed))
     return figure
 
 
@@ -94,4 +94,4 @@ def draw_path(axes: "Axes", name: str, path: Path) -> None:
         axes.plot(*path.position[-1], marker="x", color=FALLEN, markersize=9, label="fell")
     axes.set(title=name, xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, loc="center" if name == "eight" else "best")
