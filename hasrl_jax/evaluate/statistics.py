@@ -103,4 +103,4 @@ def share_interval(hits: np.ndarray) -> dict[str, float | None]:
     n, share, z = len(hits), float(np.mean(hits)), 1.96
     center = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return {"mean": share, "low": float(center - half), "high": float(center + half)}
+    return {"mean": share, "low": max(0.0, float(center - half)), "high": min(1.0, float(center + half))}

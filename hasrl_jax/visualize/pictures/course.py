@@ -89,9 +89,11 @@ def draw_path(axes: "Axes", name: str, path: Path) -> None:
     axes.plot(*path.position.T, color=WALKED, linewidth=1.5, label="walked")
     every = slice(None, None, round(ARROW_EVERY_S / 0.025))
     facing = np.stack([np.cos(path.heading[every]), np.sin(path.heading[every])])
-    axes.quiver(*path.position[every].T, *facing, color=WALKED, angles="xy", scale=22, width=0.006)
+    axes.quiver(
+        *path.position[every].T, *facing, color=WALKED, angles="xy", scale_units="xy", scale=3, units="dots", width=2
+    )
     if path.fell:
         axes.plot(*path.position[-1], marker="x", color=FALLEN, markersize=9, label="fell")
     axes.set(title=name, xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, loc="center" if name == "eight" else "best")
+    axes.legend(fontsize=7, loc=(0.32, 0.2) if name == "eight" else "best")
