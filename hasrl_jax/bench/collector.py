@@ -67,7 +67,7 @@ def with_physics(config: Config, name: str) -> Config:
 
 def make_config(arguments: argparse.Namespace, physics: str, num_workers: int) -> Config:
     """The default configuration with one round of the benchmark as an iteration."""
-    config = with_physics(Config(task=arguments.task), physics)
+    config = with_physics(from_dict({"task": arguments.task}), physics)
     return replace(
         config,
         network=replace(config.network, hidden_size=arguments.hidden, symmetric=arguments.symmetric),
