@@ -33,7 +33,7 @@ def write(path: Path, task: Task, physics: PhysicsConfig) -> None:
     option.set("integrator", physics.integrator)
     option.set("iterations", str(physics.solver_iterations))
     option.set("ls_iterations", str(physics.line_search_iterations))
-    if motors.without_curve(task.model)[1]:
+    if motors.curve_of(task.model):
         _set_motors(root, task.model)
     write_whole(path, ElementTree.tostring(root, encoding="utf-8") + b"\n")
 

@@ -103,11 +103,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           ConfigError: a command that the task does not take.
         """
         super().reset(seed=seed)
-        options = options or {}
-        if set(options) - {"command"}:
-            raise ValueError(f"options: unknown {sorted(set(options) - {'command'})}; known is 'command'")
-        told = options.get("command")
-        command = None if told is None else whole_command(self.task, told)
+        command = commanded(self.task, options)
         self._state = self._envs.reset(self.np_random)
         self._ended = False
         self._observation = self._state.observation[0].astype(np.float32)
@@ -277,6 +273,20 @@ def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 def info_names(task: Task) -> list[str]:
     """What `info` holds: `reward/<name>` for each weighted term, then the measures."""
     return [f"reward/{name}" for name in task.reward_terms] + list(task.measures)
+
+
+def commanded(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:
+    """The whole command [C] that the `options` of a reset hold; None without one.
+
+    Raises:
+      ValueError: an unknown option.
+      ConfigError: a command that the task does not take.
+    """
+    options = options or {}
+    if set(options) - {"command"}:
+        raise ValueError(f"options: unknown {sorted(set(options) - {'command'})}; known is 'command'")
+    told = options.get("command")
+    return None if told is None else whole_command(task, told)
 
 
 def whole_command(task: Task, told: Any, **named: float) -> np.ndarray:

@@ -57,14 +57,21 @@ def with_curve(model: mujoco.MjModel, no_load_speed: Mapping[str, float]) -> muj
     return model
 
 
+def curve_of(model: mujoco.MjModel) -> Curve | None:
+    """The torque-speed curve of a model's motors; None where they have none."""
+    if not (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
+        return None
+    prm = model.actuator_gainprm
+    return Curve(prm[:, VOLTAGE] * prm[:, CONSTANT] / prm[:, RESISTANCE], prm[:, VOLTAGE] / prm[:, CONSTANT])
+
+
 def without_curve(model: mujoco.MjModel) -> tuple[mujoco.MjModel, Curve | None]:
     """`model` with plain PD actuators, and the curve that is missing from it; None where there was none."""
-    if not (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
+    curve = curve_of(model)
+    if curve is None:
         return model, None
-    prm = model.actuator_gainprm
-    curve = Curve(prm[:, VOLTAGE] * prm[:, CONSTANT] / prm[:, RESISTANCE], prm[:, VOLTAGE] / prm[:, CONSTANT])
     plain = copy.copy(model)
-    for name, values in pd_parameters(prm, np).items():
+    for name, values in pd_parameters(model.actuator_gainprm, np).items():
         getattr(plain, name)[:] = values
     plain.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_NONE
     plain.actuator_gaintype[:] = mujoco.mjtGain.mjGAIN_FIXED

@@ -16,7 +16,7 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import recipe
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
-from hasrl_jax.envs.gymnasium import info_names, known_render_mode, spaces, whole_command
+from hasrl_jax.envs.gymnasium import commanded, info_names, known_render_mode, spaces, whole_command
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.scene import Scene, camera_of
 from hasrl_jax.errors import ConfigError
@@ -110,11 +110,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
           ConfigError: a command that the task does not take.
         """
         super().reset(seed=seed)
-        options = options or {}
-        if set(options) - {"command"}:
-            raise ValueError(f"options: unknown {sorted(set(options) - {'command'})}; known is 'command'")
-        told = options.get("command")
-        command = None if told is None else whole_command(self.task, told)
+        command = commanded(self.task, options)
         self._state = self._envs.reset(self.np_random)
         self._held = np.zeros(self.num_envs, bool)  # their episode is over, and the next one begins with the next step
         self._shown = self._state

@@ -30,6 +30,7 @@ def run_episodes(
     seed: int | list[int],
     mean_action: bool = True,
     seconds: float | None = None,
+    told: np.ndarray | None = None,
 ) -> Episodes:
     """Plays `episodes` episodes side by side in C MuJoCo, with the LSTM state carried through each.
 
@@ -41,12 +42,17 @@ def run_episodes(
       seed: one number or several; the same seed gives the same episodes.
       mean_action: act without exploration noise.
       seconds: the time limit instead, in simulated seconds: a randomised robot has environment steps of its own length.
+      told: [N, C] a command of each episode, held to its end; None leaves them to the task.
     """
     policy = actor.reset(config, task, parameters, episodes)
     no_limit = np.iinfo(np.int64).max
     envs = CpuEnvs(task, episodes, config.collect.max_episode_steps if seconds is None else no_limit)
     rng = np.random.Generator(np.random.Philox(seed))
     state = envs.reset(rng)
+    if told is not None:
+        assert task.with_command is not None
+        task_state, observation = task.with_command(state.task, state.observation, told, np)
+        state = state._replace(task=task_state, observation=observation)
     std = np.exp(numpy_networks.log_std(parameters, policy.mirror))
     env_step_s = state.model_fields.get("timestep", task.model.opt.timestep) * task.steps_per_env_step
     env_step_s = np.broadcast_to(env_step_s, episodes)

@@ -80,7 +80,7 @@ def nominal(
     damped = [model.joint(joints.get(name, name)).id for name in names]
     springs = [f"{side}-{joint}" for side in SIDES for joint in SPRINGS]
     gain_columns = np.zeros(model.actuator_gainprm.shape[1])
-    has_curve = motors.without_curve(model)[1] is not None
+    has_curve = motors.curve_of(model) is not None
     gain_columns[[motors.STIFFNESS, motors.DAMPING] if has_curve else 0] = 1.0
     return Nominal(
         timestep=model.opt.timestep,

@@ -6,10 +6,10 @@ import numpy as np
 
 from hasrl_jax.config import tasks
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
-from hasrl_jax.policy import actor
+from hasrl_jax.evaluate.rollout import run_episodes
+from hasrl_jax.evaluate.statistics import columns, settled_mean
 from hasrl_jax.policy.numpy_networks import Parameters
 
 if TYPE_CHECKING:
@@ -72,28 +72,15 @@ def measure(config: Config, parameters: Parameters, other: str, values: tuple[fl
     told = np.array([[command.default for command in task.commands]] * (len(values) * len(FORWARD_M_S) * EACH))
     cells = np.array([(speed, value) for value in values for speed in FORWARD_M_S for _ in range(EACH)])
     told[:, [names.index("forward"), names.index(other)]] = cells
-    steps, settled = round(SECONDS / task.env_step_s), round(SETTLED_S / task.env_step_s)
-    envs = CpuEnvs(task, len(told), steps + 1)
-    rng = np.random.Generator(np.random.Philox(seed))
-    state = envs.reset(rng)
-    task_state, observation = task.with_command(state.task, state.observation, told, np)
-    state = state._replace(task=task_state, observation=observation)
-    policy = actor.reset(config, task, parameters, len(told))
-    up, sums = np.ones(len(told), bool), np.zeros((len(told), 2))
-    counts = np.zeros(len(told))
-    columns = [task.measures.index(task.commands[names.index(name)].measure) for name in ("forward", other)]
-    for step in range(steps):
-        action, policy = actor.act(policy, state.observation, state.is_first)
-        state, result = envs.step(state, action, rng)
-        up &= ~(result.terminated | result.diverged)
-        if step >= settled:
-            sums += np.where(up[:, None], result.measures[:, columns], 0.0)
-            counts += up
-    with np.errstate(invalid="ignore"):
-        error = np.abs(sums / np.where(counts > 0, counts, np.nan)[:, None] - cells)
-    shape = (len(values), len(FORWARD_M_S), EACH)
-    means = [_mean(error[:, column].reshape(shape)) for column in (0, 1)]
-    return Grid(up.reshape(shape).mean(axis=-1), *means)
+    episodes = run_episodes(config, task, parameters, len(told), seed, seconds=SECONDS, told=told)
+    shape, column = (len(values), len(FORWARD_M_S), EACH), columns(episodes, task)
+    errors = []
+    for which, name in enumerate(("forward", other)):
+        measured = column[task.commands[names.index(name)].measure]
+        settled = np.isfinite(measured)
+        settled[: round(SETTLED_S / task.env_step_s)] = False
+        errors.append(_mean(np.abs(settled_mean(measured, settled) - cells[:, which]).reshape(shape)))
+    return Grid(episodes.reached_cap.reshape(shape).mean(axis=-1), *errors)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ class Path(NamedTuple):
     heading: np.ndarray  # [T] rad
     asked: np.ndarray  # [T, 2] where a robot would be that did exactly as told from the first moment, m
     fell: bool
+    step_s: float  # between two of them
 
 
 def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
@@ -67,7 +68,7 @@ def walk(config: Config, parameters: Parameters, name: str, course: list[Leg], s
         if outcome.ended:
             break
     asked = exact(told, slice_steps, env.task.env_step_s)
-    return Path(np.array(position), np.array(heading), asked[: len(position)], terminated)
+    return Path(np.array(position), np.array(heading), asked[: len(position)], terminated, env.task.env_step_s)
 
 
 def exact(told: list[dict[str, float]], slice_steps: int, env_step_s: float) -> np.ndarray:
@@ -87,7 +88,7 @@ def draw_path(axes: "Axes", name: str, path: Path) -> None:
     """Both paths, and where the robot faced."""
     axes.plot(*path.asked.T, color=ASKED, linewidth=1.0, linestyle="--", label="as told")
     axes.plot(*path.position.T, color=WALKED, linewidth=1.5, label="walked")
-    every = slice(None, None, round(ARROW_EVERY_S / 0.025))
+    every = slice(None, None, round(ARROW_EVERY_S / path.step_s))
     facing = np.stack([np.cos(path.heading[every]), np.sin(path.heading[every])])
     axes.quiver(
         *path.position[every].T, *facing, color=WALKED, angles="xy", scale_units="xy", scale=3, units="dots", width=2
