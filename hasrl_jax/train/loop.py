@@ -223,8 +223,8 @@ def run_iterations(
             if due(progress.iteration, config.checkpoint.every_iterations):
                 save(config, run.checkpoints, RunState(learner, progress, collector.save()))
         state = RunState(learner, progress, collector.save())
-        if not due(progress.iteration, config.checkpoint.every_iterations):
-            save(config, run.checkpoints, state)
+        if not due(progress.iteration, parts[0].config.checkpoint.every_iterations):
+            save(parts[0].config, run.checkpoints, state)
     return state
 
 

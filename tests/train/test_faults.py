@@ -17,6 +17,7 @@ from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.errors import CheckpointError, RunError
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.runs.metrics import MetricsWriter
+from hasrl_jax.train import loop
 
 ROOT = Path(__file__).parents[2]
 TINY = """
@@ -143,6 +144,24 @@ def test_ctrl_c_in_the_first_seconds_is_one_line_and_leaves_nothing(
     assert process.returncode in (0, 130)
     psutil.wait_procs(children, timeout=5)  # they notice that their parent is gone
     assert not [child for child in children if child.is_running() and child.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_ctrl_c_before_the_first_iteration_leaves_a_run_that_goes_on(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_parts = loop.make_parts
+
+    def interrupted(*arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return make_parts(*arguments)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr(loop, "make_parts", interrupted)
+        assert train_main(["--config", str(tiny), "--run-dir", str(run)]) == 0
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["000000000"]
+    assert train_main(["--resume", str(run)]) == 0
+    assert last_record(run)["env_steps"] == 512
 
 
 def test_a_first_save_that_fails_blocks_nothing(
