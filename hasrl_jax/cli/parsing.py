@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from hasrl_jax.cli.options import OneLineParser
-from hasrl_jax.config import strict_yaml
+from hasrl_jax.config import strict_yaml, tasks
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
@@ -109,7 +109,9 @@ def to_play(trained: Config, physics: str, overrides: list[str], program: str) -
     Raises:
       ConfigError: an override that cannot work, or of what a trained policy fixes.
     """
-    config = trained if physics == "training" else under_reference_physics(trained)
+    config = tasks.find(trained.task).played(trained)
+    if physics != "training":
+        config = under_reference_physics(config)
     return override_for_policy(config, overrides, program)
 
 

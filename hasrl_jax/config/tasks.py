@@ -32,6 +32,8 @@ class TaskSpec:
     check: Callable[[Config], None] | None = None  # raises ConfigError for settings that do not fit together
     # What a policy is played under: finer physics than that of the training; by default the same.
     reference_physics: Callable[[], PhysicsConfig] | None = None
+    # A configuration without what only training has: ends of episodes that spur a learner.
+    played: Callable[[Config], Config] = lambda config: config
     # The nominal robot from rest, disturbed by nobody but on request; and robots drawn at random, where there are any.
     undisturbed: Callable[[Config], Config] = lambda config: config
     randomized: Callable[[Config], Config] | None = None

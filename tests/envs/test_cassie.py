@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from hasrl_jax.cli.parsing import to_play
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cassie import commands
 from hasrl_jax.envs.cassie import task as cassie
@@ -109,6 +110,32 @@ def test_a_share_of_episodes_starts_at_the_commanded_speed() -> None:
     np.testing.assert_array_equal(fresh.qvel[moving, :2], fresh.state.command[moving])
     assert 0.4 < moving[commanded].mean() < 0.6
     assert not fresh.qvel[:, 2:].any()
+
+
+@pytest.mark.parametrize("command", [[1.0, 0.0], [0.0, 0.6], [-0.5, 0.5]])
+def test_an_episode_ends_when_the_robot_lags_behind_its_commands(command: list[float]) -> None:
+    """The distance behind, fading, summed up here by itself from the speeds that the measures tell."""
+    most, memory_s, step_s = 0.15, 0.7, 0.025
+    fixed = {"forward_m_s": [command[0]] * 2, "lateral_m_s": [command[1]] * 2, "stand_probability": 0.0}
+    bounds = {"min_height_m": 0.0, "max_tilt_deg": 180.0, "max_lag_m": most, "lag_memory_s": memory_s}
+    task, _ = _make(termination=bounds, command=fixed | {"start_moving": 0.0}, **NOMINAL_ROBOT)
+    envs, rng = CpuEnvs(task, 1, 1000), np.random.default_rng(0)
+    state, lag = envs.reset(rng), np.zeros(2)
+    speeds = [task.measures.index(name) for name in ("forward_speed", "lateral_speed")]
+    for step in range(1, 100):
+        state, result = envs.step(state, np.zeros((1, 10)), rng)
+        lag = lag * np.exp(-step_s / memory_s) + (np.array(command) - result.measures[0, speeds]) * step_s
+        assert bool(result.terminated[0]) == (np.hypot(*lag) > most)
+        if result.terminated[0]:
+            break
+    assert 5 < step < 40
+
+
+def test_no_bound_on_the_lag_where_a_policy_is_played() -> None:
+    config = from_dict({"cassie": {"termination": {"max_lag_m": 0.3, "max_tilt_deg": 40.0}}})
+    for physics in ("paper", "training"):
+        assert to_play(config, physics, [], "evaluate").settings.termination.max_lag_m == 1e6
+        assert to_play(config, physics, [], "evaluate").settings.termination.max_tilt_deg == 40.0
 
 
 def test_a_push_acts_for_its_time_and_is_then_drawn_again() -> None:

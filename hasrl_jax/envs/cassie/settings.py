@@ -134,6 +134,10 @@ class TerminationConfig:
     max_height_m: Annotated[float, Limits(1.02, 1e3)] = 3.0  # or higher
     # or when the pelvis tilts further from upright (the paper: no bound, 180)
     max_tilt_deg: Annotated[float, Limits(1, 180)] = 45.0
+    # or when it has fallen behind the commanded speeds, or run ahead of them, by more than this; a spur for training,
+    # not in force where a policy is played (the paper: no bound), m
+    max_lag_m: Annotated[float, Limits(0.01, 1e6)] = 1e6
+    lag_memory_s: Annotated[float, Limits(0.1, 1e6)] = 1.0  # time constant in which that distance is forgotten, s
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from hasrl_jax.config.files import CONFIG_FOLDER, shipped
 from hasrl_jax.config.limits import require
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.config.tasks import TaskSpec
-from hasrl_jax.envs.cassie.settings import CassieConfig
+from hasrl_jax.envs.cassie.settings import CassieConfig, TerminationConfig
 from hasrl_jax.envs.cassie.task import make, make_on
 
 
@@ -43,11 +43,16 @@ def check(config: Config) -> None:
         )
 
 
+def played(config: Config) -> Config:
+    """`config` in which no episode ends because the robot lags behind its commands."""
+    return from_dict({"cassie": {"termination": {"max_lag_m": TerminationConfig().max_lag_m}}}, config)
+
+
 def undisturbed(config: Config) -> Config:
     """`config` with the nominal robot, from rest, facing x, and no pushes but those that are asked for."""
     command = {"start_moving": 0.0, "start_heading_rad": 0.0}
     still = {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}, "command": command}
-    return from_dict({"cassie": still}, config)
+    return played(from_dict({"cassie": still}, config))
 
 
 def randomized(config: Config) -> Config:
@@ -69,6 +74,7 @@ SPEC = TaskSpec(
     settings=CassieConfig,
     check=check,
     reference_physics=reference_physics,
+    played=played,
     undisturbed=undisturbed,
     randomized=randomized,
 )

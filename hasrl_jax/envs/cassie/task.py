@@ -99,6 +99,7 @@ class CassieState(NamedTuple):
     command: Array  # [..., C] in the order of `commands.COMMANDS`
     command_s: Array  # [...] seconds until the command is drawn again
     path: Array  # [..., 2] a point that moves as commanded, world x and y, m
+    lag: Array  # [..., 2] distance by which the robot is behind its commands, along and across; fades with time, m
     target_heading: Array  # [...] the heading to keep, rad; 0 in the world frame
     standing: Array  # [...] bool: the clock rests
     push: Array  # [..., 2] force of the next push, world x and y, N
@@ -260,6 +261,7 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         command=command,
         command_s=command_s,
         path=xp.zeros((*batch, 2)),
+        lag=xp.zeros((*batch, 2)),
         target_heading=yaw,
         standing=is_standing(config, command, velocity, xp),
         push=push,
@@ -344,6 +346,8 @@ def step(
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
+    lag = next_lag(state, velocity[..., :2], limits.lag_memory_s, xp)
+    terminated = terminated | ((lag**2).sum(axis=-1) > limits.max_lag_m**2)
     yaw = frames.heading(quat, xp)
     measured = [velocity[..., :2], layout.columns([told["forward"], told["lateral"], height, yaw], xp)]
     measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
@@ -366,6 +370,7 @@ def step(
     state = state._replace(
         phase=xp.where(state.standing, state.phase, phase),
         standing=is_standing(config, command, velocity, xp),
+        lag=lag,
         command=command,
         command_s=command_s,
         push=push,
@@ -440,6 +445,17 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
     drift = xp.stack([xp.zeros_like(target), xp.clip(drift[..., 1], -config.max_drift_m, config.max_drift_m)], axis=-1)
     return state._replace(path=qpos[..., :2] + frames.turned(drift, target, xp), target_heading=target)
+
+
+def next_lag(state: CassieState, velocity: Array, memory_s: float, xp: Any) -> Array:
+    """The distance behind the commands [..., 2] in m after an environment step of dt that ended with `velocity` v.
+
+        lag' = lag e^(-dt / memory) + (command - v) dt
+
+    A steady error of the speed settles at about `memory` times itself; who starts or slows down within it is given time.
+    """
+    step_s = state.env_step_s[..., None]
+    return state.lag * xp.exp(-step_s / memory_s) + (state.command[..., :2] - velocity) * step_s
 
 
 def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) -> Array:
