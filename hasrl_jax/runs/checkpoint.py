@@ -1,7 +1,7 @@
 """Checkpoints of a training run, and the single file of a released policy.
 
-A checkpoint step is one directory, written beside its place and renamed when complete, so that a kill, a full disk
-or a lost permission never harms what was saved before. The storage library does not notice every damaged byte: a step
+A checkpoint step is one directory, written beside its place and renamed when it is complete and on the disk, so that a
+kill, a full disk, a lost permission or a loss of power never harms what was saved before. The storage library does not notice every damaged byte: a step
 carries SHA-256 digests of its files, checked before they are parsed, and of its arrays, checked after.
 """
 
@@ -27,6 +27,7 @@ import orbax.checkpoint as ocp
 
 from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn.ppo import LearnerState
+from hasrl_jax.runs import durable
 from hasrl_jax.runs.storage import open_storage
 
 log = logging.getLogger("hasrl_jax")
@@ -98,7 +99,7 @@ def save(
         with open_storage() as checkpointer:
             checkpointer.save(partial.absolute(), args=ocp.args.Composite(**items))
         (partial / _FILES_DIGEST).write_text(_digest_of_files(partial))
-        partial.rename(path)
+        durable.replace(partial, path)
     except Exception as error:
         _remove_unfinished(directory)
         raise CheckpointError(f"{directory}: cannot save step {step}: {_reason(error)}") from error
@@ -160,7 +161,7 @@ def save_policy(path: Path, parameters: Mapping[str, np.ndarray], metadata: dict
     try:
         with open(partial, "wb") as file:
             np.savez_compressed(file, **arrays)
-        partial.replace(path)
+        durable.replace(partial, path)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

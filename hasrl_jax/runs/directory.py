@@ -20,6 +20,7 @@ from hasrl_jax.config.convert import LAST, from_dict
 from hasrl_jax.config.files import dump_yaml
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, RunError
+from hasrl_jax.runs import durable
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -186,7 +187,7 @@ def write_config(run_dir: Path, config: Config) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(dump_yaml(config), encoding="utf-8")
-        partial.replace(path)
+        durable.replace(partial, path)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {_reason(error)}") from None
 

@@ -271,6 +271,60 @@ for step in range(3, 1000):
 """
 
 
+class Disk:
+    """What would be left after a loss of power: files and lists of names as they were when they were forced to it."""
+
+    def __init__(self, root: Path):
+        self.root = root
+        self.files: dict[int, bytes] = {}  # inode -> content
+        self.names: dict[int, dict[str, int]] = {}  # inode of a directory -> name -> inode
+        self.moments: list[tuple[dict[int, bytes], dict[int, dict[str, int]]]] = []
+
+    def force(self, descriptor: int) -> None:
+        """Takes the place of os.fsync."""
+        path, inode = Path(os.readlink(f"/proc/self/fd/{descriptor}")), os.fstat(descriptor).st_ino
+        if path.is_dir():
+            self.names = self.names | {inode: {entry.name: entry.inode() for entry in os.scandir(path)}}
+        else:
+            self.files = self.files | {inode: path.read_bytes()}
+        self.moments.append((self.files, self.names))
+
+    def restore(self, moment: int, path: Path) -> None:
+        """Writes what was left at a moment to `path`."""
+        files, names = self.moments[moment]
+
+        def write(inode: int, place: Path) -> None:
+            if inode in names:
+                place.mkdir()
+                for name, child in names[inode].items():
+                    write(child, place / name)
+            elif inode in files:
+                place.write_bytes(files[inode])
+
+        write(self.root.stat().st_ino, path)
+
+
+def test_a_loss_of_power_at_any_moment_leaves_a_whole_checkpoint(
+    tmp_path: Path, learner: LearnerState, second: LearnerState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory, left = tmp_path / "checkpoints", tmp_path / "left"
+    directory.mkdir()
+    disk = Disk(directory)
+    monkeypatch.setattr(os, "fsync", disk.force)
+    checkpoint.save(directory, 1, learner, EXTRA | {"iteration": 1}, BLOBS, keep=1)
+    first = len(disk.moments) - 1
+    checkpoint.save(directory, 2, second, EXTRA, BLOBS, keep=1)
+    assert len(disk.moments) > first + 5
+    for moment in (first, *range(first + 1, len(disk.moments), 4), len(disk.moments) - 1):
+        disk.restore(moment, left)
+        is_last = moment == len(disk.moments) - 1
+        assert checkpoint.steps(left) == ([1, 2] if is_last else [1])
+        loaded = checkpoint.load(left, learner)
+        assert_equal(loaded.learner, second if is_last else learner)
+        assert loaded.blobs == BLOBS
+        shutil.rmtree(left)
+
+
 def test_killed_while_saving(directory: Path, learner: LearnerState) -> None:
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     root = Path(__file__).parents[2]
