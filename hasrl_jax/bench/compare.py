@@ -121,7 +121,7 @@ def make_config(arguments: argparse.Namespace) -> Config:
 def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> list[int]:
     """The numbers of environments to try: each must divide an update, and a minibatch, into whole sequences."""
     sequences = config.ppo.minibatch_trajectories, env_steps // config.collect.unroll_length
-    asked = arguments.num_envs or sorted({arguments.num_workers, 4, 8, 16})
+    asked = arguments.num_envs or sorted({arguments.num_workers, 4, 8, 16, 32})
     choices = [number for number in asked if number > 0 and not any(count % number for count in sequences)]
     if arguments.num_envs and choices != asked:
         refused = next(number for number in asked if number not in choices)

@@ -1,8 +1,9 @@
 """Checkpoints of a training run, and the single file of a released policy.
 
-A checkpoint step is one directory, written beside its place and renamed when it is complete and on the disk, so that a
-kill, a full disk, a lost permission or a loss of power never harms what was saved before. The storage library does not notice every damaged byte: a step
-carries SHA-256 digests of its files, checked before they are parsed, and of its arrays, checked after.
+A checkpoint step is one directory, written beside its place and renamed when it is complete and on the disk, so that
+a kill, a full disk, a lost permission or a loss of power never harms what was saved before. The storage library does
+not notice every damaged byte: a step carries SHA-256 digests of its files, checked before they are parsed, and of its
+arrays, checked after.
 """
 
 import contextlib
