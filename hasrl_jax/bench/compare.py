@@ -129,13 +129,13 @@ def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> 
     return choices or [1]
 
 
-def require_packages(peers: list[str]) -> None:
-    """Raises a ConfigError that names what is not installed."""
+def require_packages(peers: list[str], option: str = "--peers") -> None:
+    """Raises a ConfigError that names what is not installed, and the `option` that asks for it."""
     needs = {module: name for peer in peers for module, name in NEEDS[peer].items()}
     missing = [name for module, name in needs.items() if importlib.util.find_spec(module) is None]
     if missing:
-        remedy = 'install the extra, pip install -e ".[compare]", or leave peers out with --peers'
-        raise ConfigError(f"--peers: {', '.join(missing)} not installed; {remedy}")
+        remedy = 'install the extra, pip install -e ".[compare]", or leave them out'
+        raise ConfigError(f"{option}: {', '.join(missing)} not installed; {remedy}")
 
 
 def search(peer: str, config: Config, choices: list[int], threads: list[int]) -> list[dict]:
