@@ -169,12 +169,18 @@ def save_policy(path: Path, parameters: Mapping[str, np.ndarray], metadata: dict
         raise CheckpointError(f"{path}: cannot save the policy: {_reason(error)}") from error
 
 
-def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def load_policy(path: Path, expected: str = "a policy file") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `save_policy` wrote: (parameters, metadata).
+
+    Args:
+      path: the file.
+      expected: what to say where there is none.
 
     Raises:
       CheckpointError: missing, not a policy file, damaged, or larger than LARGEST_POLICY.
     """
+    if not path.is_file():  # nor anything else that has a name: opening a pipe would wait for ever
+        raise CheckpointError(f"{path}: there is no such file; expected {expected}")
     try:
         with open(path, "rb") as file:
             _require_moderate_size(file)
@@ -184,10 +190,11 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if str(digest) != _digest(arrays, {_POLICY_METADATA: text}):
             raise _DamagedError("its contents do not match their SHA-256 digest")
         return arrays, json.loads(str(text))
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: there is no policy file") from None
     except Exception as error:  # zip and NumPy raise many kinds for damaged files
-        raise CheckpointError(f"{path}: not a policy file, or damaged: {_reason(error)}") from error
+        reason = _reason(error)
+        if "pickle" in reason:  # NumPy's advice how to load it nevertheless
+            reason = "it holds more than plain arrays of numbers"
+        raise CheckpointError(f"{path}: not a policy file, or damaged: {reason}") from error
 
 
 def _require_moderate_size(file: BinaryIO) -> None:

@@ -367,7 +367,7 @@ def test_released_policy_is_small(tmp_path: Path) -> None:
 
 def test_damaged_policy(tmp_path: Path, learner: LearnerState) -> None:
     path = tmp_path / "policy.npz"
-    with pytest.raises(CheckpointError, match=f"{path}: there is no policy file"):
+    with pytest.raises(CheckpointError, match=f"{path}: there is no such file; expected a policy file"):
         checkpoint.load_policy(path)
     checkpoint.save_policy(path, ppo.export_parameters(learner), {})
     good = path.read_bytes()
@@ -398,6 +398,19 @@ def test_a_policy_file_that_would_fill_the_memory_is_not_unpacked(
     monkeypatch.setattr(checkpoint, "LARGEST_POLICY", 10**6 - 1)
     with pytest.raises(CheckpointError, match=f"it would unpack to {10**6} bytes"):
         checkpoint.load_policy(path)
+
+
+def test_a_policy_file_that_is_none_of_ours(tmp_path: Path) -> None:
+    path = tmp_path / "policy.npz"
+    os.mkfifo(path)
+    with pytest.raises(CheckpointError, match="there is no such file"):  # and no wait for somebody who writes
+        checkpoint.load_policy(path)
+    path.unlink()
+    fields = [(f"field_{number}_" + "x" * 40, "<f4") for number in range(400)]  # a header that NumPy calls unsafe
+    for array in (np.array([print], object), np.zeros(1, fields)):
+        np.savez(path, array)
+        with pytest.raises(CheckpointError, match=r"damaged: it holds more than plain arrays of numbers$"):
+            checkpoint.load_policy(path)
 
 
 def test_policy_that_cannot_be_written(tmp_path: Path, learner: LearnerState) -> None:
