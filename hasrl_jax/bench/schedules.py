@@ -187,7 +187,13 @@ def tables(figures: dict) -> str:
 
     target = f"return {figures['target']:g}"
     names = ["env_steps_to_target", "seconds_to_target", "return_at_end", "seconds", "policy_lag"]
-    headers = [f"env steps to {target}", f"seconds to {target}", "test return at the end", "seconds", "policy lag"]
+    headers = [
+        f"env steps to {target}",
+        f"seconds to {target}",
+        "evaluation return at the end",
+        "seconds",
+        "policy lag",
+    ]
     rows = []
     for schedule in SCHEDULES:
         runs = [run for run in figures["runs"] if run["schedule"] == schedule]

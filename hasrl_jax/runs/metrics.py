@@ -237,10 +237,8 @@ def _end_of_iteration(path: Path, iteration: int) -> int:
 
     Read from the end, where that is: a long run is continued as soon as a short one.
     """
-    position, later = (
-        path.stat().st_size,
-        b"",
-    )  # where what was read begins, and the part of it whose line begins before
+    position = path.stat().st_size  # where what was read begins
+    later = b""  # the end of a line that begins before
     with open(path, "rb") as file:
         while position:
             size = min(_BLOCK, position)

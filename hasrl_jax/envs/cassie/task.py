@@ -213,7 +213,7 @@ def noise_size(config: CassieConfig) -> int:
 
 
 def player_constants(config: CassieConfig) -> dict[str, Any]:
-    """What who plays a policy elsewhere must know besides the observations and actions; see docs/deploy.md."""
+    """Constants, besides observations and actions, that a program needs to play a policy; see docs/deploy.md."""
     clock_fields = ["cycle_s", "cycle_per_speed_s", "quicken_above_m_s"]
     in_heading = config.command.frame == "heading"
     return {
@@ -427,8 +427,8 @@ def clock_signal(state: CassieState, xp: Any) -> Array:
 def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> CassieState:
     """`state` with the heading and the path to keep moved on by an environment step, which ended in `qpos`.
 
-    In the heading frame both wait for a robot that is too far off them: who is twisted or shoved away has to get its
-    speeds right from there on, not to return.
+    In the heading frame the error of both is bounded: a robot that was turned or pushed away goes on from where it is
+    at the commanded speeds, and need not return.
     """
     config, moved = constants.config.command, state.command[..., :2] * state.env_step_s[..., None]
     if config.frame == "world":
