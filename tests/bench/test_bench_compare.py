@@ -7,18 +7,15 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.bench import compare, learner
 from hasrl_jax.cli.bench import main
 from hasrl_jax.config.convert import from_dict
 
-TINY = """
-task: cartpole
-physics: {timestep_s: 0.005, steps_per_env_step: 2, integrator: Euler}
-network: {hidden_size: 8}
-collect: {envs_per_worker: 4, env_steps_per_iteration: 128, unroll_length: 8, max_episode_steps: 20}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-"""
+TINY = tiny_yaml(
+    physics={"steps_per_env_step": 2}, collect={"envs_per_worker": 4, "unroll_length": 8, "max_episode_steps": 20}
+)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.errors import CheckpointError, RunError
@@ -20,15 +21,7 @@ from hasrl_jax.runs.metrics import MetricsWriter
 from hasrl_jax.train import loop
 
 ROOT = Path(__file__).parents[2]
-TINY = """
-task: cartpole
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 2, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-evaluate: {every_iterations: 0, episodes: 2}
-checkpoint: {every_iterations: 2}
-total_env_steps: 512
-"""
+TINY = tiny_yaml(evaluate={"every_iterations": 0})
 FOREVER = ("--total-env-steps", 10**9)
 
 

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import psutil
 import pytest
+from tiny import tiny
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.backends import make_collector
@@ -29,19 +30,11 @@ from hasrl_jax.types import Trajectory
 
 SCHEDULES = ("sync", "overlap", "decoupled")
 STEPS = 128  # environment steps of an iteration
-TINY = {
-    "task": "cartpole",
-    "total_env_steps": 10**9,
-    "physics": {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"},
-    "network": {"hidden_size": 8, "initial_log_std": -1.0},
-    "collect": {
-        **{"num_workers": 2, "envs_per_worker": 2, "env_steps_per_iteration": STEPS, "unroll_length": 16},
-        **{"max_episode_steps": 40, "worker_timeout_s": 2.0},
-    },
-    "ppo": {"epochs": 1, "minibatch_trajectories": 8},
-    "evaluate": {"every_iterations": 0},
-    "checkpoint": {"every_iterations": 2},
-}
+TINY = tiny(
+    total_env_steps=10**9,
+    collect={"env_steps_per_iteration": STEPS, "worker_timeout_s": 2.0},
+    evaluate={"every_iterations": 0},
+)
 Hook = Callable[[dict], None]
 
 
