@@ -26,6 +26,7 @@ from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import load_yaml
 from hasrl_jax.config.schema import Config, available_cores
+from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate.rollout import run_episodes
@@ -108,6 +109,8 @@ def make_config(arguments: argparse.Namespace, num_workers: int) -> Config:
     changes |= {"evaluate": {"every_iterations": 0}, "checkpoint": {"every_iterations": 0, "keep": 1}}
     config = from_dict(changes | {"collect": {"num_workers": num_workers}}, config)
     check(config)
+    if not isinstance(config.settings, CassieConfig):
+        raise ConfigError(f"--config: {arguments.config} trains task {config.task}; expected one that walks")
     return config
 
 

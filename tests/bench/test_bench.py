@@ -105,11 +105,14 @@ def test_schedules_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.
 
 
 def test_walking_trains_and_judges(
-    tiny: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """The cart-pole stands in for the robot; that it walks in the second look is made up, what is timed is not."""
-    with open(tiny, "a") as file:
-        file.write("collect: {envs_per_worker: 2, env_steps_per_iteration: 64, unroll_length: 4}\n")
+    """That it walks in the second look is made up, what is timed is not."""
+    tiny = str(tmp_path / "tiny.yaml")
+    Path(tiny).write_text(
+        "network: {hidden_size: 8}\nppo: {epochs: 1, minibatch_trajectories: 16}\n"
+        "collect: {envs_per_worker: 2, env_steps_per_iteration: 64, unroll_length: 4}\nevaluate: {episodes: 1}\n"
+    )
     cores = os.sched_getaffinity(0)
     learners, workers = set(), set()
     update = ppo.Update.__call__
@@ -148,6 +151,7 @@ def test_who_stands_still_or_falls_does_not_walk() -> None:
     [
         (["schedules", "--seeds", "0"], "--seeds"),
         (["walking", "--every", "0"], "--every"),
+        (["walking", "--config", "cartpole"], "expected one that walks"),
         (["schedules", "--update-shares", "-1"], "--update-shares"),
         (["schedules", "--total-env-steps", "0"], "total_env_steps"),
         (["parity", "--states", "0"], "--states"),
