@@ -27,7 +27,7 @@ OPTIONS = (
     *("--collect.unroll-length", 16, "--evaluate.every-iterations", 200, "--evaluate.episodes", 2),
     *("--checkpoint.every-iterations", 100, "--total-env-steps", ITERATIONS * STEPS),
 )
-EVERY_S = 1.0  # between two looks
+EVERY_S = 0.5  # between two looks
 MOST_GROWTH = 0.03  # of the memory, from the second quarter of a run to its last
 LONG, SHORT = 100_000, 10  # records
 

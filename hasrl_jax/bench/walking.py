@@ -8,12 +8,13 @@ would give the workers of some schedules time to collect that the run does not c
 """
 
 import argparse
+import contextlib
 import os
 import signal
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -98,16 +99,18 @@ def take_turns(config: Config, arguments: argparse.Namespace, cores: list[int]) 
 def make_config(arguments: argparse.Namespace, num_workers: int) -> Config:
     """The configuration without evaluations and saves on the way."""
     config = load_yaml(arguments.config)
-    asked = {
-        "total_env_steps": arguments.total_env_steps,
-        "network": {"hidden_size": arguments.hidden_size},
-        "ppo": {"epochs": arguments.epochs},
+    changes: dict[str, Any] = {
+        "collect": {"num_workers": num_workers},
+        "evaluate": {"every_iterations": 0},
+        "checkpoint": {"every_iterations": 0, "keep": 1},
     }
-    total, *groups = asked.items()
-    given = {name: {key: x for key, x in group.items() if x is not None} for name, group in groups}
-    changes: dict[str, Any] = given | ({} if total[1] is None else dict([total]))
-    changes |= {"evaluate": {"every_iterations": 0}, "checkpoint": {"every_iterations": 0, "keep": 1}}
-    config = from_dict(changes | {"collect": {"num_workers": num_workers}}, config)
+    if arguments.total_env_steps is not None:
+        changes["total_env_steps"] = arguments.total_env_steps
+    if arguments.hidden_size is not None:
+        changes["network"] = {"hidden_size": arguments.hidden_size}
+    if arguments.epochs is not None:
+        changes["ppo"] = {"epochs": arguments.epochs}
+    config = from_dict(changes, config)
     check(config)
     if not isinstance(config.settings, CassieConfig):
         raise ConfigError(f"--config: {arguments.config} trains task {config.task}; expected one that walks")
@@ -117,7 +120,8 @@ def make_config(arguments: argparse.Namespace, num_workers: int) -> Config:
 def pin(process: int, cores: list[int]) -> None:
     """Keeps every thread of a process, and those it starts later, on some cores."""
     for thread in os.listdir(f"/proc/{process}/task"):
-        os.sched_setaffinity(int(thread), cores)
+        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setaffinity(int(thread), cores)
 
 
 class Watched:
@@ -235,6 +239,9 @@ def summary(curve: Curve, looks: list[dict[str, Any]]) -> dict[str, float | None
 def tables(figures: dict) -> str:
     """Seconds to walking by schedule, mean ± standard deviation over the seeds that walked."""
 
+    def walked(runs: list[dict]) -> int:
+        return sum(run["seconds_to_walking"] is not None for run in runs)
+
     def spread(runs: list[dict], name: str) -> str:
         values = [run[name] for run in runs if run[name] is not None]
         if not values:
@@ -242,26 +249,23 @@ def tables(figures: dict) -> str:
         deviation = statistics.stdev(values) if len(values) > 1 else 0.0
         return f"{statistics.mean(values):,.4g} ± {deviation:,.2g}"
 
-    columns: dict[str, Callable[[list[dict]], object]] = {
-        "walked": lambda runs: f"{sum(run['seconds_to_walking'] is not None for run in runs)} of {len(runs)}",
-        **{
-            heading: (lambda runs, name=name: spread(runs, name))  # type: ignore[misc]
-            for heading, name in {
-                "seconds to walking": "seconds_to_walking",
-                "env steps to walking": "env_steps_to_walking",
-                "iteration s": "iteration_seconds",
-                "collect s": "collect_seconds",
-                "update s": "update_seconds",
-                "wait s": "wait_seconds",
-                "policy lag": "policy_lag",
-                "seconds in all": "seconds",
-            }.items()
-        },
+    columns = {
+        "seconds to walking": "seconds_to_walking",
+        "env steps to walking": "env_steps_to_walking",
+        "iteration s": "iteration_seconds",
+        "collect s": "collect_seconds",
+        "update s": "update_seconds",
+        "wait s": "wait_seconds",
+        "policy lag": "policy_lag",
+        "seconds in all": "seconds",
     }
     by_schedule: dict[str, list[dict]] = {}
     for run in figures["runs"]:
         by_schedule.setdefault(run["schedule"], []).append(run)
-    rows = [[schedule, *(column(runs) for column in columns.values())] for schedule, runs in by_schedule.items()]
+    rows = [
+        [schedule, f"{walked(runs)} of {len(runs)}", *(spread(runs, name) for name in columns.values())]
+        for schedule, runs in by_schedule.items()
+    ]
     where = "all cores shared" if figures["shared"] else "the learner on a core of its own"
     stated = (
         f"{figures['config']}, {figures['num_workers']} workers, {where}. Walking: at "
@@ -269,4 +273,4 @@ def tables(figures: dict) -> str:
         f"{100 * figures['least_up']:g} % of {figures['episodes']} episodes stay up for 10 s, and the settled speed "
         f"error is at most {figures['most_error']:g} m/s. Means ± standard deviations over seeds."
     )
-    return f"{stated}\n\n{format_table(['schedule', *columns], rows)}"
+    return f"{stated}\n\n{format_table(['schedule', 'walked', *columns], rows)}"
