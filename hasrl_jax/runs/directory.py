@@ -50,9 +50,10 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
       resume: continue the run that is there.
 
     Raises:
-      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, or
-        cannot be written.
+      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, cannot
+        be written, or has a name that is not UTF-8.
     """
+    _require_utf8(Path(config.run_dir))
     if resume:
         path = Path(config.run_dir)
         _require_run(path)
@@ -140,6 +141,15 @@ def _require_inside(path: Path) -> None:
         place = path / name
         if not place.resolve().is_relative_to(inside):
             raise RunError(f"{place}: a link that leads out of the run, to {place.resolve()}; put what it names here")
+
+
+def _require_utf8(path: Path) -> None:
+    """Refuses a path that Python took apart byte by byte, as it does where the language of the system is ASCII."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        remedy = "set PYTHONUTF8=1, or choose another run_dir"
+        raise RunError(f"{str(path)!a}: checkpoints need a path in UTF-8; {remedy}") from None
 
 
 def _require_run(path: Path) -> None:
