@@ -168,13 +168,15 @@ def train_watched(
     """A run, and the copies of its policy by iteration.
 
     Raises:
-      KeyboardInterrupt: it was asked to stop.
+      ConfigError: its stages change the update; KeyboardInterrupt: it was asked to stop.
     """
     made: list[Watched] = []
 
-    def make_update(*sizes: Any) -> Watched:
+    def make_update(part: Config, *sizes: Any) -> Watched:
+        if part.ppo != config.ppo:
+            raise ConfigError("stages: got one that changes ppo; expected one update for the whole run")
         normalized = config.network.normalize_observations
-        made[:] = made or [Watched(program(*sizes), arguments.every, arguments.seconds, cores, normalized)]
+        made[:] = made or [Watched(program(part, *sizes), arguments.every, arguments.seconds, cores, normalized)]
         return made[0]
 
     curve = read_run(config, make_update)

@@ -1,5 +1,6 @@
 """`hasrl PROGRAM ...`: one program with sub-commands, the same as `python -m hasrl_jax.PROGRAM ...`."""
 
+import contextlib
 import difflib
 import importlib
 import os
@@ -68,8 +69,9 @@ def _may_open_files() -> bool:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
     if soft < most:
-        soft = most
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        with contextlib.suppress(OSError, ValueError):  # the system grants less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+            soft = most
     if soft < LEAST_FILES:
         text = f"at most {soft} files may be open at once; expected {LEAST_FILES} or more (ulimit -n)"
         os.write(2, f"error: {text}\n".encode())
