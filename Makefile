@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install lint type test mutation bench docs wheel lock
+.PHONY: install lint type test mutation soak bench docs wheel lock
 
 install:  ## virtual environment with everything that development needs
 	$(PYTHON) -m venv .venv
@@ -20,6 +20,9 @@ test:
 mutation:  ## which changes of the mathematics no test notices; hours
 	$(BIN)/pip install -c requirements.lock -e ".[dev,mutation]"
 	nice -n 19 $(BIN)/python tests/mutation.py
+
+soak:  ## long runs: memory, descriptors and threads stay where they are; minutes on an idle machine
+	$(BIN)/python tests/soak.py
 
 bench:  ## timed figures on an idle machine, and the tables of docs/ from them
 	for name in collector scaling learner mjx parity; do \

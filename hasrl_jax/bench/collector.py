@@ -30,7 +30,7 @@ ITEMS = ("physics", "inference", "environment", "other")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the collector benchmark."""
     default = from_dict({})
-    parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
+    parser.add_argument("--task", default=default.task, metavar="NAME")
     parser.add_argument("--num-workers", type=int, nargs="+", default=sorted({1, available_cores()}), metavar="N")
     parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")
     parser.add_argument("--physics", choices=(*PHYSICS, "both"), default="both", help="2 kHz x 50, or 2.5 ms x 10")

@@ -121,7 +121,7 @@ def make_config(arguments: argparse.Namespace) -> Config:
 def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> list[int]:
     """The numbers of environments to try: each must divide an update, and a minibatch, into whole sequences."""
     sequences = config.ppo.minibatch_trajectories, env_steps // config.collect.unroll_length
-    asked = arguments.num_envs or sorted({arguments.num_workers, 4, 8, 16})
+    asked = arguments.num_envs or sorted({arguments.num_workers, 4, 8, 16, 32})
     choices = [number for number in asked if number > 0 and not any(count % number for count in sequences)]
     if arguments.num_envs and choices != asked:
         refused = next(number for number in asked if number not in choices)
@@ -129,13 +129,13 @@ def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> 
     return choices or [1]
 
 
-def require_packages(peers: list[str]) -> None:
-    """Raises a ConfigError that names what is not installed."""
+def require_packages(peers: list[str], option: str = "--peers") -> None:
+    """Raises a ConfigError that names what is not installed, and the `option` that asks for it."""
     needs = {module: name for peer in peers for module, name in NEEDS[peer].items()}
     missing = [name for module, name in needs.items() if importlib.util.find_spec(module) is None]
     if missing:
-        remedy = 'install the extra, pip install -e ".[compare]", or leave peers out with --peers'
-        raise ConfigError(f"--peers: {', '.join(missing)} not installed; {remedy}")
+        remedy = 'install the extra, pip install -e ".[compare]", or leave them out'
+        raise ConfigError(f"{option}: {', '.join(missing)} not installed; {remedy}")
 
 
 def search(peer: str, config: Config, choices: list[int], threads: list[int]) -> list[dict]:

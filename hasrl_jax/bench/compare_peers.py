@@ -25,6 +25,7 @@ from hasrl_jax.collect.worker import die_with_parent, reply
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registration import ENVIRONMENTS
+from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import WorkerError
 from hasrl_jax.policy.blas import ONE_THREAD
 
@@ -178,9 +179,9 @@ def torch_lstm(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[
     constructors = [functools.partial(make_env, config, os.getpid())] * num_envs
     envs = AsyncVectorEnv(constructors, autoreset_mode=AutoresetMode.SAME_STEP)  # no step is spent on a reset
     try:
-        from hasrl_jax.bench.compare_torch import Learner  # after the sub-processes, which need no torch
+        from hasrl_jax.bench.compare_torch import Trainer  # after the sub-processes, which need no torch
 
-        learner = Learner(envs, config.ppo, config.network.hidden_size, config.network.initial_log_std, config.seed)
+        learner = Trainer(envs, config.ppo, config.network.hidden_size, config.network.initial_log_std, config.seed)
 
         def iterate() -> tuple[float, float]:
             started = time.perf_counter()
@@ -189,10 +190,27 @@ def torch_lstm(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[
             learner.update(batch)
             return collected - started, time.perf_counter() - started
 
-        networks = learner.policy, learner.value
-        yield sum(parameter.numel() for network in networks for parameter in network.parameters()), iterate
+        yield learner.parameters, iterate
     finally:
         envs.close()
+
+
+@contextlib.contextmanager
+def torch_update(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int, Iterate]]:
+    """The update of `compare_torch` alone, on as many sequences of noise as there would be environments."""
+    from hasrl_jax.bench.compare_torch import Learner, noise
+
+    task, hidden = make_task(config), config.network.hidden_size
+    sizes = task.observation_size, task.action_size
+    learner = Learner(*sizes, config.ppo, hidden, config.network.initial_log_std, config.seed)
+    batch = noise(learner, num_envs, env_steps // num_envs, hidden)
+
+    def iterate() -> tuple[float, float]:
+        started = time.perf_counter()
+        learner.update(batch)
+        return 0.0, time.perf_counter() - started
+
+    yield learner.parameters, iterate
 
 
 @contextlib.contextmanager
@@ -216,7 +234,7 @@ def single(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int,
     env.close()
 
 
-PEERS = {"sb3": sb3, "torch": torch_lstm, "single": single}
+PEERS = {"sb3": sb3, "torch": torch_lstm, "torch_update": torch_update, "single": single}
 
 
 def serve(connection: Connection) -> None:

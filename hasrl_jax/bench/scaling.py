@@ -29,7 +29,7 @@ from hasrl_jax.learn import ppo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the scaling benchmark."""
     default = from_dict({})
-    parser.add_argument("--task", choices=("cassie", "cartpole"), default="cassie")
+    parser.add_argument("--task", default="cassie", metavar="NAME")
     parser.add_argument("--num-workers", type=int, nargs="+", default=[1, 2, 4, 8], metavar="N", help="1 always runs")
     parser.add_argument("--envs-per-worker", type=int, default=MOST_ENVS, metavar="E")
     parser.add_argument("--physics", choices=tuple(collector.PHYSICS), default="fast", help="2 kHz, or 400 Hz")

@@ -115,20 +115,31 @@ class Sleep:
 
 
 def run(config: Config, make_update: Callable[..., Any], **changes: Any) -> Curve:
-    """Trains in a directory that is thrown away; returns the records of its metrics file.
+    """`read_run` with some settings changed.
 
     Raises:
       KeyboardInterrupt: the run was asked to stop.
     """
-    with tempfile.TemporaryDirectory() as directory:
-        config = from_dict(changes | {"run_dir": directory}, config)
-        with contextlib.redirect_stdout(io.StringIO()):
-            train(config, make_update=make_update)
-        lines = (Path(directory) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
-    records: Curve = [json.loads(line) for line in lines]
-    if not records or records[-1]["env_steps"] < config.total_env_steps:
+    config = from_dict(changes, config)
+    records = read_run(config, make_update)
+    if records[-1]["env_steps"] < config.total_env_steps:
         raise KeyboardInterrupt
     return records
+
+
+def read_run(config: Config, make_update: Callable[..., Any]) -> Curve:
+    """Trains in a directory that is thrown away; returns the records of its metrics file.
+
+    Raises:
+      KeyboardInterrupt: the run was asked to stop in its first iteration.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        with contextlib.redirect_stdout(io.StringIO()):
+            train(from_dict({"run_dir": directory}, config), make_update=make_update)
+        lines = (Path(directory) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
+    if not lines:
+        raise KeyboardInterrupt
+    return [json.loads(line) for line in lines]
 
 
 def measure_hiding(config: Config, iterations: int, update_shares: list[float]) -> list[dict]:
@@ -176,7 +187,13 @@ def tables(figures: dict) -> str:
 
     target = f"return {figures['target']:g}"
     names = ["env_steps_to_target", "seconds_to_target", "return_at_end", "seconds", "policy_lag"]
-    headers = [f"env steps to {target}", f"seconds to {target}", "test return at the end", "seconds", "policy lag"]
+    headers = [
+        f"env steps to {target}",
+        f"seconds to {target}",
+        "evaluation return at the end",
+        "seconds",
+        "policy lag",
+    ]
     rows = []
     for schedule in SCHEDULES:
         runs = [run for run in figures["runs"] if run["schedule"] == schedule]

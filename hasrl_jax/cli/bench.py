@@ -21,6 +21,7 @@ BENCHES = {
     "compare": ("hasrl_jax.bench.compare", "ours against stable-baselines3 and a torch PPO on gymnasium"),
     "mjx": ("hasrl_jax.bench.mjx", "physics and environment steps/s of MJX by number of environments"),
     "parity": ("hasrl_jax.bench.parity", "how closely MJX follows C MuJoCo: observations, rewards, terminations"),
+    "walking": ("hasrl_jax.bench.walking", "seconds to walking by schedule, learner and workers on cores of their own"),
     "schedules": ("hasrl_jax.bench.schedules", "learning curves by schedule, and what each hides of an iteration"),
 }
 

@@ -1,5 +1,6 @@
 """`hasrl PROGRAM ...`: one program with sub-commands, the same as `python -m hasrl_jax.PROGRAM ...`."""
 
+import contextlib
 import difflib
 import importlib
 import os
@@ -25,7 +26,8 @@ PROGRAMS = {
     "doctor": ("hasrl_jax.cli.doctor", "what this machine has and lacks"),
 }
 
-
+LEAST_FILES = 64  # libraries, a checkpoint that is being written, and a few workers
+MOST_FILES = 8192  # each worker needs one
 WINDOWS = (
     "error: hasrl_jax runs on Linux and macOS; on Windows install it inside WSL 2 (in PowerShell: wsl --install), "
     "where its workers can inherit file descriptors; docs/troubleshooting.md says more"
@@ -42,6 +44,8 @@ def start(program: str, arguments: list[str] | None = None) -> int:
     if sys.platform == "win32":
         print(WINDOWS, file=sys.stderr)
         return 1
+    if not _may_open_files():
+        return 1
     for descriptor in (0, 1, 2):  # one that is closed would soon be a file of ours, and what is printed would go there
         try:
             os.fstat(descriptor)
@@ -56,6 +60,22 @@ def start(program: str, arguments: list[str] | None = None) -> int:
     main_of: Callable[[list[str]], int] = importlib.import_module(PROGRAMS[program][0]).main
     signal.signal(signal.SIGINT, handler)
     return main_of(sys.argv[1:] if arguments is None else arguments)
+
+
+def _may_open_files() -> bool:
+    """Whether enough files may be open at once; takes up to MOST_FILES of what the system grants."""
+    import resource  # not on Windows
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    if soft < most:
+        with contextlib.suppress(OSError, ValueError):  # the system grants less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+            soft = most
+    if soft < LEAST_FILES:
+        text = f"at most {soft} files may be open at once; expected {LEAST_FILES} or more (ulimit -n)"
+        os.write(2, f"error: {text}\n".encode())
+    return soft >= LEAST_FILES
 
 
 def _leave(*_: object) -> None:

@@ -46,6 +46,19 @@ def worker_environment(environment: Mapping[str, str]) -> dict[str, str]:
     return blas_variables() | given | ONE_THREAD
 
 
+def are_of_all_workers(states: list[bytes], num_workers: int) -> bool:
+    """Whether there is a saved state for each worker; warns where there are states of another number of them."""
+    if states and len(states) != num_workers:
+        log.warning("%d workers saved, %d run: all episodes begin anew", len(states), num_workers)
+    return len(states) == num_workers
+
+
+def warn_unless_loaded(index: int, state: bytes, loaded: bool) -> None:
+    """Says that a worker could not take over the state that it was given."""
+    if state and not loaded:
+        log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+
+
 class _Worker(NamedTuple):
     process: subprocess.Popen
     connection: Connection
@@ -204,9 +217,7 @@ class CpuPool:
 
     def load(self, states: list[bytes]) -> None:
         """Restores what `save` returned; environments that differ in number begin new episodes instead."""
-        if len(states) != self.plan.num_workers:
-            if states:
-                log.warning("%d workers saved, %d run: all episodes begin anew", len(states), self.plan.num_workers)
+        if not are_of_all_workers(states, self.plan.num_workers):
             return
         for index, state in enumerate(states):
             self._send(index, {"do": "load"})
@@ -214,8 +225,8 @@ class CpuPool:
             reply, failure = self._reply_to(index)
             if failure is not None:
                 self._replace(index, failure)
-            elif state and not json.loads(reply)["loaded"]:
-                log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+            else:
+                warn_unless_loaded(index, state, json.loads(reply)["loaded"])
 
     def configure(self, config: Config) -> None:
         """Changes the settings of the task in every worker; only between `finish` and `start`.

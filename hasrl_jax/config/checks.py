@@ -84,4 +84,4 @@ def _check_machines(config: Config) -> None:
 
 def _is_host_and_port(address: str) -> bool:
     host, _, port = address.rpartition(":")
-    return host != "" and port.isdecimal() and 0 < int(port) < 65536
+    return host != "" and port.isascii() and port.isdecimal() and 0 < int(port) < 65536

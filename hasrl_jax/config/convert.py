@@ -6,7 +6,7 @@ import math
 import typing
 from typing import Annotated, Any, Literal
 
-from hasrl_jax.config.limits import shown
+from hasrl_jax.config.limits import named, shown
 from hasrl_jax.config.schema import Config
 from hasrl_jax.config.tasks import config_class
 from hasrl_jax.errors import ConfigError
@@ -48,7 +48,7 @@ def _replaced(base: Any, values: Any, where: str) -> Any:
     known = [f.name for f in dataclasses.fields(base)]
     changes = {}
     for key, value in values.items():
-        path = f"{where}.{key}"
+        path = f"{where}.{named(key)}"
         if key not in known:
             raise ConfigError(f"{path}: unknown field; known fields are {', '.join(known)}")
         current = getattr(base, key)
@@ -89,7 +89,7 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
     if origin is dict:
         if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
             raise ConfigError(f"{path}: got {shown(value)}; expected a mapping of names")
-        return {key: x if args[1] is Any else _convert(x, args[1], f"{path}.{key}") for key, x in value.items()}
+        return {key: x if args[1] is Any else _convert(x, args[1], f"{path}.{named(key)}") for key, x in value.items()}
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _replaced(hint(), value, path)
     return _scalar(value, hint, path)
@@ -127,5 +127,5 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted name."""
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return found

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from hasrl_jax.config.checks import check
-from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.convert import flat, from_dict
+from hasrl_jax.config.limits import named
 from hasrl_jax.config.schema import Config, StageConfig
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Record
@@ -98,10 +99,15 @@ class Stages:
 def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
     """`config` with some fields replaced, and checked."""
     changeable = (*([config.section] if config.section else []), *CHANGEABLE)
+    fields = [field for part in changes.items() for field in flat(dict([part]))]
+    for field in fields:
+        if fields.count(field) > 1:
+            raise ConfigError(f"{name}.set: {named(field)} is given twice")
     for field, value in changes.items():
         parts = field.split(".")
         if parts[0] not in changeable:
-            raise ConfigError(f"{name}.set: {field} cannot change during a run; {', '.join(changeable)} settings can")
+            which = ", ".join(changeable)
+            raise ConfigError(f"{name}.set: {named(field)} cannot change during a run; {which} settings can")
         for part in reversed(parts):
             value = {part: value}
         try:

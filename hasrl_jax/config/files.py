@@ -8,7 +8,7 @@ import yaml
 
 from hasrl_jax.config import strict_yaml, tasks
 from hasrl_jax.config.convert import from_dict, to_dict
-from hasrl_jax.config.limits import shown
+from hasrl_jax.config.limits import named, shown
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError
 
@@ -62,9 +62,12 @@ def dump_yaml(config: Config) -> str:
 
 def _resolve(source: str | Path, folder: Path) -> Path:
     """The file that `source` names, seen from `folder`."""
-    named = CONFIG_FOLDER / f"{source}.yaml"
-    path = folder / source
-    return named if not path.exists() and Path(source).name == str(source) and named.is_file() else path
+    in_configs, path = CONFIG_FOLDER / f"{source}.yaml", folder / source
+    try:
+        is_there = path.exists() or Path(source).name != str(source) or not in_configs.is_file()
+    except OSError:  # no file can have such a name; reading it says so
+        is_there = True
+    return path if is_there else in_configs
 
 
 def _values(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
@@ -73,7 +76,7 @@ def _values(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"--config {path}: cannot be read ({reason}); {_shipped_names()}") from None
+        raise ConfigError(f"--config {named(str(path))}: cannot be read ({reason}); {_shipped_names()}") from None
     try:
         values = strict_yaml.parse(text)
     except ValueError as error:

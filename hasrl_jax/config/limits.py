@@ -44,5 +44,10 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
 
 
+def named(key: Any) -> str:
+    """A name as it stands, unless it would break the line of an error message or fill it."""
+    return key if isinstance(key, str) and key.isprintable() and 0 < len(key) <= 80 else shown(key)
+
+
 def _number(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hasrl_jax.config.limits import shown
+from hasrl_jax.config.limits import named, shown
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.errors import ConfigError
 
@@ -95,8 +95,9 @@ def _load(name: str, place: str) -> TaskSpec:
     module, _, attribute = place.partition(":")
     try:
         spec = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"task: got {shown(name)}, which cannot be loaded from {place} ({error})") from None
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ConfigError(f"task: got {shown(name)}, which cannot be loaded from {named(place)} ({reason})") from None
     if not isinstance(spec, TaskSpec):
         raise ConfigError(f"task: got {shown(name)}; {place} is no TaskSpec but {shown(spec)}")
     taken = {field.name for field in dataclasses.fields(Config)}

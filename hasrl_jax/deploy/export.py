@@ -11,6 +11,7 @@ from hasrl_jax.deploy.metadata import describe
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import CheckpointError
 from hasrl_jax.policy.numpy_networks import Parameters
+from hasrl_jax.runs import durable
 
 SUFFIXES = {"npz": ".npz", "onnx": ".onnx", "jax": ".zip"}  # of each format
 
@@ -52,7 +53,7 @@ def write(
                 f"{path}: not written: its actions differ from the policy's by {found.difference:.1e}; "
                 f"expected at most {verify.TOLERANCE:g}"
             )
-        partial.replace(path)
+        durable.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
     return found

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hasrl_jax.errors import CheckpointError, ConfigError
+from hasrl_jax.runs import durable
 
 # (observation [E, O] float32, carry [E, L, 2, W] float32) -> (action [E, A], next carry)
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -38,7 +39,7 @@ def write_whole(path: Path, content: bytes) -> None:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)
-        partial.replace(path)
+        durable.replace(partial, path)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

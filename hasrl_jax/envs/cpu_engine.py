@@ -39,7 +39,7 @@ class StepResult(NamedTuple):
     reward: Array  # [E]
     terminated: Array  # [E] bool
     truncated: Array  # [E] bool: the time limit
-    diverged: Array  # [E] bool: the simulation failed; nothing of this step is valid
+    diverged: Array  # [E] bool: the simulation failed, or the task did; nothing of this step is valid
     final_observation: Array  # [E, O] the true next observation, also where a new episode begins
     reward_terms: Array  # [E, R]
     measures: Array  # [E, M]
@@ -121,6 +121,8 @@ class CpuEnvs:
         task = self.task
         physics, reading, diverged = self._simulate(state, self._control(state, action))
         result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)
+        # Nor may what the task makes of a good simulation spoil a whole batch, or the statistics of the observations.
+        diverged |= ~np.isfinite(result.observation.sum(axis=-1) + result.reward)
         episode_step = state.episode_step + 1
         terminated = result.terminated & ~diverged
         truncated = (episode_step >= self.max_episode_steps) & ~terminated & ~diverged

@@ -1,6 +1,6 @@
 """One environment on MuJoCo's JAX port: pure functions, to be vmapped; the engine behind the MJX mode.
 
-The counterpart of `cpu_env` for accelerators. Shapes are those of a single environment. A reset needs no physics, so
+The counterpart of `cpu_engine` for accelerators. Shapes are those of a single environment. A reset needs no physics, so
 every step prepares a fresh episode and takes it where the last one ended: each episode has draws of its own.
 """
 

@@ -1,6 +1,6 @@
 """What a task is: pure functions over arrays that both physics engines call.
 
-A task never steps physics. An engine (`cpu_env` or `mjx_env`) does, and asks the task what to
+A task never steps physics. An engine (`cpu_engine` or `mjx_engine`) does, and asks the task what to
 apply, what to average over the physics steps, and what it all means. Every function takes `xp`,
 the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, written `...` below.
 """
@@ -86,12 +86,12 @@ class Task:
     commands: tuple[Command, ...] = ()
     # (state, observation, command [..., C], xp) -> (state, observation): told from now to the end of the episode
     with_command: Callable[[Any, Array, Array, Any], tuple[Any, Array]] | None = None
-    # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
     # (state, xp) -> the action [..., A] that still acts at the beginning of an environment step, and for how long, s
     delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
+    # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
     with_push: Callable[[Any, Array, Any], Any] | None = None
     push_s: float = 0.0
-    # what who plays a policy without this package must know besides, by name, ready for JSON
+    # further constants that a program needs to play a policy without this package, by name, ready for JSON
     player_constants: dict[str, Any] = field(default_factory=dict)
 
     @property

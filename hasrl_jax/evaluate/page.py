@@ -167,18 +167,18 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     walking = select(rows, "speed")
     commanded = [row["forward_m_s"][0] for row in walking]
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.2), layout="constrained")
-    for colour, randomized in zip(COLORS, (False, True), strict=False):
+    for color, randomized in zip(COLORS, (False, True), strict=False):
         chosen = select(rows, "speed", randomized=randomized)
         label = "randomised" if randomized else "nominal"
-        _curve(axes[0], chosen, "share_up", label, colour, scale=100)
-        _curve(axes[1], chosen, "forward_speed", label, colour)
-    for colour, (name, theirs) in zip(COLORS[2:] * 9, list(policies.items())[1:], strict=False):
-        _curve(axes[0], select(theirs, "speed"), "share_up", name, colour, scale=100)
+        _curve(axes[0], chosen, "share_up", label, color, scale=100)
+        _curve(axes[1], chosen, "forward_speed", label, color)
+    for color, (name, theirs) in zip(COLORS[2:] * 9, list(policies.items())[1:], strict=False):
+        _curve(axes[0], select(theirs, "speed"), "share_up", name, color, scale=100)
     axes[1].plot(commanded, commanded, color="grey", linewidth=0.8, linestyle="--", label="as commanded")
     pushes = select(rows, "push")
-    for colour, speed in zip(COLORS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
+    for color, speed in zip(COLORS, sorted({row["forward_m_s"][0] for row in pushes}), strict=False):
         chosen = [row for row in pushes if row["forward_m_s"][0] == speed]
-        _curve(axes[2], chosen, "share_up", f"{speed:g} m/s", colour, scale=100)
+        _curve(axes[2], chosen, "share_up", f"{speed:g} m/s", color, scale=100)
     _curve(axes[3], walking, "step_frequency_hz", "steps per second", COLORS[0])
     _curve(axes[3], walking, "duty_factor", "duty factor", COLORS[1])
     _curve(axes[3], walking, "cost_of_transport", "cost of transport", COLORS[2])
@@ -201,7 +201,7 @@ def plot(policy: str, policies: dict[str, Rows], path: Path) -> None:
     plt.close(figure)
 
 
-def _curve(axis: Any, rows: Rows, key: str, label: str, colour: str, scale: float = 1.0) -> None:
+def _curve(axis: Any, rows: Rows, key: str, label: str, color: str, scale: float = 1.0) -> None:
     """A line with its 95 % intervals over the commanded speed or the push, through the rows that have a value."""
     points = [row for row in rows if row[key]["mean"] is not None]
     if not points:
@@ -211,4 +211,4 @@ def _curve(axis: Any, rows: Rows, key: str, label: str, colour: str, scale: floa
     mean = [scale * v["mean"] for v in values]
     low = [max(0.0, scale * (v["mean"] - v["low"])) for v in values]
     high = [max(0.0, scale * (v["high"] - v["mean"])) for v in values]
-    axis.errorbar(x, mean, yerr=(low, high), label=label, color=colour, marker="o", markersize=3)
+    axis.errorbar(x, mean, yerr=(low, high), label=label, color=color, marker="o", markersize=3)

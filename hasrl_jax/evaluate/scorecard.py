@@ -250,7 +250,7 @@ def write(
         for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
             measured.append(row)
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-            if name == own:
+            if name == own and len(measured) < len(rows(config)):  # the last one is written below
                 write_page(report, directory)
             robot = "randomised" if row["randomized"] else "nominal"
             share, spent = percent(row["share_up"]), time.monotonic() - started

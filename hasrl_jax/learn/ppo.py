@@ -215,13 +215,13 @@ class Update:
         (policy, value, _), history = jax.lax.scan(minibatch_step, (policy, value, jnp.asarray(True)), indices)
         log_std = networks.log_std(self.policy, policy[0])
         metrics |= _summarize(*history)
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((policy, value))]
-        metrics["parameters_finite"] = jnp.all(jnp.stack(finite)).astype(jnp.float32)
-        metrics |= {"learning_rate": scale * ppo.policy_learning_rate, "std_mean": jnp.mean(jnp.exp(log_std))}
         steps = batch.trajectory
         normalizer = state.normalizer
         if config.network.normalize_observations:
             normalizer = normalize.update(normalizer, steps.observation, steps.mask & counts)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((policy, value, normalizer))]
+        metrics["parameters_finite"] = jnp.all(jnp.stack(finite)).astype(jnp.float32)
+        metrics |= {"learning_rate": scale * ppo.policy_learning_rate, "std_mean": jnp.mean(jnp.exp(log_std))}
         added = jnp.sum(steps.mask & counts, dtype=jnp.int32)
         new_state = LearnerState(
             policy_params=policy[0],

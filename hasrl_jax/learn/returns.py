@@ -74,5 +74,5 @@ def masked_variance(values: jax.Array, mask: jax.Array) -> jax.Array:
 
 def masked_standardize(values: jax.Array, mask: jax.Array, epsilon: float = 1e-8) -> jax.Array:
     """(values - mean) / standard deviation over the valid steps; 0 elsewhere. Shapes as `values`."""
-    centred = values - masked_mean(values, mask)
-    return jnp.where(mask, centred / (jnp.sqrt(masked_variance(values, mask)) + epsilon), 0.0)
+    centered = values - masked_mean(values, mask)
+    return jnp.where(mask, centered / (jnp.sqrt(masked_variance(values, mask)) + epsilon), 0.0)

@@ -28,6 +28,7 @@ RELEASED = {
     "released-steer": _FOLDER / "cassie_steer.npz",
     "released-stairs": _FOLDER / "cassie_stairs.npz",
 }
+EXPECTED = f"a policy file, or one of {', '.join(RELEASED)}"
 # Of the files; a digest inside a file finds damage, and this one a file that was put in its place.
 RELEASED_SHA256 = {
     "released": "a848c5a08b333bcc5d869a874a3b3bdbe69af6a580e4a3739e6c992f393d575f",
@@ -56,8 +57,6 @@ def load_policy_parameters(
         return _from_run(Path(run_dir))
     source = policy or "released"
     path = RELEASED.get(str(source), Path(source))
-    if not path.exists():
-        raise CheckpointError(f"{path}: there is no such file; expected a policy file, or one of {', '.join(RELEASED)}")
     if str(source) in RELEASED_SHA256:
         _require_released(path, RELEASED_SHA256[str(source)])
     return _from_file(path)
@@ -171,7 +170,7 @@ def training_digest_of(policy: str | Path | None) -> str | None:
     """
     if policy is None:
         return None
-    _, metadata = checkpoint.load_policy(RELEASED.get(str(policy), Path(policy)))
+    _, metadata = checkpoint.load_policy(RELEASED.get(str(policy), Path(policy)), EXPECTED)
     found = metadata.get("training_sha256")
     return found if isinstance(found, str) else None
 
@@ -212,7 +211,7 @@ def _require_released(path: Path, expected: str) -> None:
 
 
 def _from_file(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
-    parameters, metadata = checkpoint.load_policy(path)
+    parameters, metadata = checkpoint.load_policy(path, EXPECTED)
     try:
         config = from_dict(upgraded(metadata["config"]))
         check(config)

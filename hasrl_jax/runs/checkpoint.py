@@ -1,8 +1,9 @@
 """Checkpoints of a training run, and the single file of a released policy.
 
-A checkpoint step is one directory, written beside its place and renamed when complete, so that a kill, a full disk
-or a lost permission never harms what was saved before. The storage library does not notice every damaged byte: a step
-carries SHA-256 digests of its files, checked before they are parsed, and of its arrays, checked after.
+A checkpoint step is one directory, written beside its place and renamed when it is complete and on the disk, so that
+a kill, a full disk, a lost permission or a loss of power never harms what was saved before. The storage library does
+not notice every damaged byte: a step carries SHA-256 digests of its files, checked before they are parsed, and of its
+arrays, checked after.
 """
 
 import contextlib
@@ -27,6 +28,7 @@ import orbax.checkpoint as ocp
 
 from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn.ppo import LearnerState
+from hasrl_jax.runs import durable
 from hasrl_jax.runs.storage import open_storage
 
 log = logging.getLogger("hasrl_jax")
@@ -98,7 +100,7 @@ def save(
         with open_storage() as checkpointer:
             checkpointer.save(partial.absolute(), args=ocp.args.Composite(**items))
         (partial / _FILES_DIGEST).write_text(_digest_of_files(partial))
-        partial.rename(path)
+        durable.replace(partial, path)
     except Exception as error:
         _remove_unfinished(directory)
         raise CheckpointError(f"{directory}: cannot save step {step}: {_reason(error)}") from error
@@ -160,19 +162,25 @@ def save_policy(path: Path, parameters: Mapping[str, np.ndarray], metadata: dict
     try:
         with open(partial, "wb") as file:
             np.savez_compressed(file, **arrays)
-        partial.replace(path)
+        durable.replace(partial, path)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         raise CheckpointError(f"{path}: cannot save the policy: {_reason(error)}") from error
 
 
-def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def load_policy(path: Path, expected: str = "a policy file") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `save_policy` wrote: (parameters, metadata).
+
+    Args:
+      path: the file.
+      expected: what to say where there is none.
 
     Raises:
       CheckpointError: missing, not a policy file, damaged, or larger than LARGEST_POLICY.
     """
+    if not path.is_file():  # nor anything else that has a name: opening a pipe would wait for ever
+        raise CheckpointError(f"{path}: there is no such file; expected {expected}")
     try:
         with open(path, "rb") as file:
             _require_moderate_size(file)
@@ -182,10 +190,11 @@ def load_policy(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if str(digest) != _digest(arrays, {_POLICY_METADATA: text}):
             raise _DamagedError("its contents do not match their SHA-256 digest")
         return arrays, json.loads(str(text))
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: there is no policy file") from None
     except Exception as error:  # zip and NumPy raise many kinds for damaged files
-        raise CheckpointError(f"{path}: not a policy file, or damaged: {_reason(error)}") from error
+        reason = _reason(error)
+        if "pickle" in reason:  # NumPy's advice how to load it nevertheless
+            reason = "it holds more than plain arrays of numbers"
+        raise CheckpointError(f"{path}: not a policy file, or damaged: {reason}") from error
 
 
 def _require_moderate_size(file: BinaryIO) -> None:

@@ -20,6 +20,7 @@ from hasrl_jax.config.convert import LAST, from_dict
 from hasrl_jax.config.files import dump_yaml
 from hasrl_jax.config.schema import Config
 from hasrl_jax.errors import ConfigError, RunError
+from hasrl_jax.runs import durable
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -49,9 +50,10 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
       resume: continue the run that is there.
 
     Raises:
-      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, or
-        cannot be written.
+      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, cannot
+        be written, or has a name that is not UTF-8.
     """
+    _require_utf8(Path(config.run_dir))
     if resume:
         path = Path(config.run_dir)
         _require_run(path)
@@ -141,6 +143,15 @@ def _require_inside(path: Path) -> None:
             raise RunError(f"{place}: a link that leads out of the run, to {place.resolve()}; put what it names here")
 
 
+def _require_utf8(path: Path) -> None:
+    """Refuses a path that Python took apart byte by byte, as it does where the language of the system is ASCII."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        remedy = "set PYTHONUTF8=1, or choose another run_dir"
+        raise RunError(f"{str(path)!a}: checkpoints need a path in UTF-8; {remedy}") from None
+
+
 def _require_run(path: Path) -> None:
     if not path.is_dir():
         raise RunError(f"{path}: there is no such run directory")
@@ -186,7 +197,7 @@ def write_config(run_dir: Path, config: Config) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(dump_yaml(config), encoding="utf-8")
-        partial.replace(path)
+        durable.replace(partial, path)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {_reason(error)}") from None
 

@@ -24,6 +24,7 @@ from hasrl_jax.runs.directory import METRICS_FILE, TENSORBOARD_DIRECTORY
 
 log = logging.getLogger("hasrl_jax")
 _COLLECT_METRICS = ("env_steps", "stage", "diverged_envs", "workers_lost", "dropped_stale", "replay_ratio")
+_BLOCK = 2**16  # bytes that are read at once
 _RATE_WINDOW = 20  # iterations over which the speed behind "time left" is measured
 
 
@@ -232,15 +233,31 @@ def _clock(seconds: float | None) -> str:
 
 
 def _end_of_iteration(path: Path, iteration: int) -> int:
-    """Where the records up to `iteration` end, bytes; what follows is later, or torn by a crash."""
-    end = position = 0
+    """Where the records up to `iteration` end, bytes; what follows is later, or torn by a crash.
+
+    Read from the end, where that is: a long run is continued as soon as a short one.
+    """
+    position = path.stat().st_size  # where what was read begins
+    later = b""  # the end of a line that begins before
     with open(path, "rb") as file:
-        for line in file:
-            position += len(line)
-            try:
-                number = json.loads(line)["iteration"]
-            except (ValueError, TypeError, KeyError):
-                continue
-            if line.endswith(b"\n") and isinstance(number, int) and number <= iteration:
-                end = position
-    return end
+        while position:
+            size = min(_BLOCK, position)
+            position -= size
+            file.seek(position)
+            lines = (file.read(size) + later).splitlines(keepends=True)
+            later = lines.pop(0) if position else b""
+            end = position + len(later) + sum(map(len, lines))
+            for line in reversed(lines):
+                if line.endswith(b"\n") and _iteration_of(line) <= iteration:
+                    return end
+                end -= len(line)
+    return 0
+
+
+def _iteration_of(line: bytes) -> float:
+    """Which iteration a record is of; infinity where it is none."""
+    try:
+        number = json.loads(line)["iteration"]
+    except (ValueError, TypeError, KeyError):
+        return math.inf
+    return number if isinstance(number, int) else math.inf

@@ -79,10 +79,10 @@ def fig3(runs: list[Series], names: list[str]) -> "Figure":
 def fig4(runs: list[Series], names: list[str]) -> "Figure":
     """Paper Fig. 4: one line per run."""
     figure, axes = _axes(2)
-    for colour, run, name in zip(COLORS, runs, names, strict=False):
+    for color, run, name in zip(COLORS, runs, names, strict=False):
         for axis, metric in zip(axes, ("ratio_mean", "episode_return_train"), strict=True):
-            axis.plot(run["iteration"], run[metric], color=colour, linewidth=0.4, alpha=0.4)
-            axis.plot(run["iteration"], moving_mean(run[metric]), color=colour, linewidth=1.2, label=name)
+            axis.plot(run["iteration"], run[metric], color=color, linewidth=0.4, alpha=0.4)
+            axis.plot(run["iteration"], moving_mean(run[metric]), color=color, linewidth=1.2, label=name)
     axes[0].axhline(1.0, color="grey", linewidth=0.6)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=7)
     _label(axes[0], "(a) mean ratio", "iteration")
@@ -93,11 +93,11 @@ def fig4(runs: list[Series], names: list[str]) -> "Figure":
 def curve(runs: list[Series], names: list[str]) -> "Figure":
     """Episode length and return of every run against environment steps and time."""
     figure, axes = _axes(4)
-    for colour, run, name in zip(COLORS, runs, names, strict=False):
+    for color, run, name in zip(COLORS, runs, names, strict=False):
         seconds = run.get("train_seconds", np.nancumsum(run["collect_seconds"] + run["update_seconds"]))
         xs = (run["env_steps"] / 1e6, seconds / 60)
         for axis, (metric, x) in zip(axes, ((m, x) for m in ("length", "return") for x in xs), strict=True):
-            axis.plot(x, moving_mean(run[f"episode_{metric}_train"]), color=colour, linewidth=1, label=name)
+            axis.plot(x, moving_mean(run[f"episode_{metric}_train"]), color=color, linewidth=1, label=name)
     for axis, unit in zip(axes, ("million environment steps", "minutes of training") * 2, strict=True):
         _label(axis, "episode length" if axis in axes[:2] else "episode return", unit)
     if any(names):

@@ -1,16 +1,21 @@
 """The benchmarks run from their command line and report what they promise; no figure is judged here."""
 
+import itertools
 import json
 import math
+import os
 from pathlib import Path
+from typing import Any
 
 import jax
+import psutil
 import pytest
 from PIL import Image
 
-from hasrl_jax.bench import mjx, report
+from hasrl_jax.bench import mjx, report, walking
 from hasrl_jax.cli.bench import main
 from hasrl_jax.config.schema import Config
+from hasrl_jax.learn import ppo
 
 TINY = """
 task: cartpole
@@ -99,10 +104,56 @@ def test_schedules_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.
         assert image.size[0] > image.size[1] > 200
 
 
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="learner and workers need a core each")
+def test_walking_trains_and_judges(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """That it walks in the second look is made up, what is timed is not."""
+    tiny = str(tmp_path / "tiny.yaml")
+    Path(tiny).write_text(
+        "network: {hidden_size: 8}\nppo: {epochs: 1, minibatch_trajectories: 16}\n"
+        "collect: {envs_per_worker: 2, env_steps_per_iteration: 64, unroll_length: 4}\nevaluate: {episodes: 1}\n"
+    )
+    cores = os.sched_getaffinity(0)
+    learners, workers = set(), set()
+    update = ppo.Update.__call__
+
+    def watched(self: ppo.Update, *arguments: Any) -> Any:
+        learners.add(frozenset(os.sched_getaffinity(0)))
+        children = [child for child in psutil.Process().children() if "hasrl_jax.collect.worker" in child.cmdline()]
+        workers.update(frozenset(child.cpu_affinity()) for child in children)
+        return update(self, *arguments)
+
+    monkeypatch.setattr(ppo.Update, "__call__", watched)
+    monkeypatch.setattr(walking, "play", lambda *_: [{"speed": 1.0, "share_up": 1.0, "error": next(errors)}])
+    errors = itertools.cycle([0.3, 0.1])
+    arguments = ["--config", tiny, "--seeds", "1", "--schedules", "sync", "decoupled", "--total-env-steps", "512"]
+    figures = tmp_path / "walking.json"
+    assert main(["walking", *arguments, "--every", "2", "--json", str(figures)]) == 0
+    assert "1 of 1" in capsys.readouterr().out
+    assert (learners, workers) == ({frozenset({min(cores)})}, {frozenset(cores - {min(cores)})})
+    assert os.sched_getaffinity(0) == cores
+    runs = json.loads(figures.read_text())["figures"]["runs"]
+    assert [run["schedule"] for run in runs] == ["sync", "decoupled"]
+    for run in runs:
+        assert [look["iteration"] for look in run["looks"]] == [2, 4]
+        assert run["env_steps_to_walking"] == run["looks"][1]["env_steps"] >= 256
+        assert 0 < run["looks"][0]["seconds"] < run["seconds_to_walking"] < run["seconds"]
+
+
+def test_who_stands_still_or_falls_does_not_walk() -> None:
+    good = {"speed": 0.5, "share_up": 0.95, "error": 0.1}
+    assert walking.is_walking([good, good], 0.9, 0.2)
+    for bad in ({"share_up": 0.85}, {"error": 0.5}, {"error": None}):
+        assert not walking.is_walking([good, good | bad], 0.9, 0.2)
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["schedules", "--seeds", "0"], "--seeds"),
+        (["walking", "--every", "0"], "--every"),
+        (["walking", "--config", "cartpole"], "expected one that walks"),
         (["schedules", "--update-shares", "-1"], "--update-shares"),
         (["schedules", "--total-env-steps", "0"], "total_env_steps"),
         (["parity", "--states", "0"], "--states"),

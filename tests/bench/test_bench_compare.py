@@ -7,17 +7,15 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tiny import tiny_yaml
 
-from hasrl_jax.bench import compare
+from hasrl_jax.bench import compare, learner
 from hasrl_jax.cli.bench import main
+from hasrl_jax.config.convert import from_dict
 
-TINY = """
-task: cartpole
-physics: {timestep_s: 0.005, steps_per_env_step: 2, integrator: Euler}
-network: {hidden_size: 8}
-collect: {envs_per_worker: 4, env_steps_per_iteration: 128, unroll_length: 8, max_episode_steps: 20}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-"""
+TINY = tiny_yaml(
+    physics={"steps_per_env_step": 2}, collect={"envs_per_worker": 4, "unroll_length": 8, "max_episode_steps": 20}
+)
 
 
 @pytest.fixture
@@ -117,6 +115,18 @@ def test_missing_packages_are_one_line(
     (error,) = capsys.readouterr().err.splitlines()
     assert error.startswith("error: --peers: torch, stable-baselines3, sb3-contrib not installed")
     assert "[compare]" in error
+    assert main(["learner", "--torch"]) == 2
+    assert capsys.readouterr().err.startswith("error: --torch: torch not installed")
+
+
+def test_the_update_takes_turns_with_torch(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    pytest.importorskip("torch")
+    config = from_dict({"task": "cartpole", "network": {"hidden_size": 8}, "ppo": {"minibatch_trajectories": 8}})
+    monkeypatch.setattr(learner, "sizes", lambda name: (config, 16, 4))
+    found = learner.in_turns(3, 1)
+    assert found["ratio_least"] <= found["ratio"] <= found["ratio_most"]
+    assert min(found["ours_seconds"], found["torch_seconds"]) > 0
+    assert "torch / ours" in learner.tables({"cells": [], "torch": found})
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,7 @@ def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
         ([{"at_env_steps": 100, "set": {"network.hidden_size": 4}}], r"network.hidden_size cannot change during a run"),
         ([{"at_env_steps": 100, "set": {"cassie.push.force": [0, 1]}}], r"config.cassie.push.force: unknown field"),
         ([{"at_env_steps": 100, "set": {"cassie.push.force_n": [5, 1]}}], r"cassie.push.force_n: got .* low <= high"),
+        ([{"at_env_steps": 9, "set": {"ppo.clip": 0.1, "ppo": {"clip": 0.2}}}], r"set: ppo.clip is given twice"),
         ([STAGES[0], STAGES[0]], r"stages\[1\].at_env_steps: got 1000; expected more than 1000"),
         ([{"at_env_steps": 1, "set": {"ppo.clip": 0.1}, "wait_for": {"x": "much"}}], r"wait_for.x: got 'much'"),
     ],

@@ -1,5 +1,8 @@
 """The batched C MuJoCo environments: episodes, determinism, independence, divergence, restoring."""
 
+import dataclasses
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import Transition
 
 TASK = make_task(from_dict({}))
 LAYING = make_task(from_dict({"cassie": {"termination": {"min_height_m": 0.0, "max_tilt_deg": 180.0}}}))  # never ends
@@ -120,6 +124,21 @@ def test_a_diverged_simulation_is_flagged_alone(bad: float) -> None:
     np.testing.assert_array_equal(result.final_observation[[0, 2]], healthy.final_observation[[0, 2]])
     _, following = envs.step(after, action, np.random.default_rng(0))
     assert not following.diverged.any()
+
+
+@pytest.mark.parametrize("field", ["observation", "reward"])
+def test_a_task_that_gives_nan_is_flagged_alone(field: str) -> None:
+    def step(*arguments: Any) -> Transition:
+        outcome = TASK.step(*arguments)
+        values = getattr(outcome, field).copy()
+        values[1, ...] = np.nan
+        return outcome._replace(**{field: values})
+
+    envs = CpuEnvs(dataclasses.replace(TASK, step=step), 3, 1000)
+    state, results = _run(envs, 1)
+    np.testing.assert_array_equal(results[0].diverged, [False, True, False])
+    np.testing.assert_array_equal(state.is_first, [False, True, False])
+    assert not any(np.isnan(values).any() for values in _leaves(state))
 
 
 def test_a_bad_action_is_an_error() -> None:

@@ -147,7 +147,7 @@ def test_impossible_commands_are_refused() -> None:
         pole.set_command(0.0, 0.0)
 
 
-def test_a_randomised_robot_reports_its_step_and_pose() -> None:
+def test_a_randomized_robot_reports_its_step_and_pose() -> None:
     env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": True}}}))
     env.reset(seed=0)
     assert env.step_s != env.task.env_step_s

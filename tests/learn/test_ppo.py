@@ -83,7 +83,7 @@ def _numbers(tree: Any) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-def test_fresh_batch_has_ratio_one_also_after_the_normaliser_has_moved() -> None:
+def test_fresh_batch_has_ratio_one_also_after_the_normalizer_has_moved() -> None:
     state, update = _learner(_config())
     for seed in range(2):
         state, metrics = update(state, _fresh(state, LENGTHS, seed))

@@ -180,6 +180,9 @@ def _changed(tmp_path: Path, **changes: np.ndarray) -> Path:
         ("policy/log_std", np.full(10, np.nan, np.float32), "holds numbers that are not finite"),
         ("policy/mean_bias", np.full(10, np.inf, np.float32), "holds numbers that are not finite"),
         ("policy/mean_bias", np.array(["x"] * 10), "is of type <U1; expected float32"),
+        ("policy/mean_bias", np.zeros(10, complex), "is of type complex128; expected float32"),
+        ("policy/mean_bias", np.zeros(10, "datetime64[s]"), r"is of type datetime64\[s\]; expected float32"),
+        ("policy/mean_bias", np.zeros(10, [("a", "<f4")]), r"is of type \[\('a', '<f4'\)\]; expected float32"),
         ("normalizer/std", np.zeros(50, np.float32), "holds numbers that are not positive"),
     ],
 )

@@ -271,6 +271,60 @@ for step in range(3, 1000):
 """
 
 
+class Disk:
+    """What would be left after a loss of power: files and lists of names as they were when they were forced to it."""
+
+    def __init__(self, root: Path):
+        self.root = root
+        self.files: dict[int, bytes] = {}  # inode -> content
+        self.names: dict[int, dict[str, int]] = {}  # inode of a directory -> name -> inode
+        self.moments: list[tuple[dict[int, bytes], dict[int, dict[str, int]]]] = []
+
+    def force(self, descriptor: int) -> None:
+        """Takes the place of os.fsync."""
+        path, inode = Path(os.readlink(f"/proc/self/fd/{descriptor}")), os.fstat(descriptor).st_ino
+        if path.is_dir():
+            self.names = self.names | {inode: {entry.name: entry.inode() for entry in os.scandir(path)}}
+        else:
+            self.files = self.files | {inode: path.read_bytes()}
+        self.moments.append((self.files, self.names))
+
+    def restore(self, moment: int, path: Path) -> None:
+        """Writes what was left at a moment to `path`."""
+        files, names = self.moments[moment]
+
+        def write(inode: int, place: Path) -> None:
+            if inode in names:
+                place.mkdir()
+                for name, child in names[inode].items():
+                    write(child, place / name)
+            elif inode in files:
+                place.write_bytes(files[inode])
+
+        write(self.root.stat().st_ino, path)
+
+
+def test_a_loss_of_power_at_any_moment_leaves_a_whole_checkpoint(
+    tmp_path: Path, learner: LearnerState, second: LearnerState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory, left = tmp_path / "checkpoints", tmp_path / "left"
+    directory.mkdir()
+    disk = Disk(directory)
+    monkeypatch.setattr(os, "fsync", disk.force)
+    checkpoint.save(directory, 1, learner, EXTRA | {"iteration": 1}, BLOBS, keep=1)
+    first = len(disk.moments) - 1
+    checkpoint.save(directory, 2, second, EXTRA, BLOBS, keep=1)
+    assert len(disk.moments) > first + 5
+    for moment in (first, *range(first + 1, len(disk.moments), 4), len(disk.moments) - 1):
+        disk.restore(moment, left)
+        is_last = moment == len(disk.moments) - 1
+        assert checkpoint.steps(left) == ([1, 2] if is_last else [1])
+        loaded = checkpoint.load(left, learner)
+        assert_equal(loaded.learner, second if is_last else learner)
+        assert loaded.blobs == BLOBS
+        shutil.rmtree(left)
+
+
 def test_killed_while_saving(directory: Path, learner: LearnerState) -> None:
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     root = Path(__file__).parents[2]
@@ -313,7 +367,7 @@ def test_released_policy_is_small(tmp_path: Path) -> None:
 
 def test_damaged_policy(tmp_path: Path, learner: LearnerState) -> None:
     path = tmp_path / "policy.npz"
-    with pytest.raises(CheckpointError, match=f"{path}: there is no policy file"):
+    with pytest.raises(CheckpointError, match=f"{path}: there is no such file; expected a policy file"):
         checkpoint.load_policy(path)
     checkpoint.save_policy(path, ppo.export_parameters(learner), {})
     good = path.read_bytes()
@@ -344,6 +398,19 @@ def test_a_policy_file_that_would_fill_the_memory_is_not_unpacked(
     monkeypatch.setattr(checkpoint, "LARGEST_POLICY", 10**6 - 1)
     with pytest.raises(CheckpointError, match=f"it would unpack to {10**6} bytes"):
         checkpoint.load_policy(path)
+
+
+def test_a_policy_file_that_is_none_of_ours(tmp_path: Path) -> None:
+    path = tmp_path / "policy.npz"
+    os.mkfifo(path)
+    with pytest.raises(CheckpointError, match="there is no such file"):  # and no wait for somebody who writes
+        checkpoint.load_policy(path)
+    path.unlink()
+    fields = [(f"field_{number}_" + "x" * 40, "<f4") for number in range(400)]  # a header that NumPy calls unsafe
+    for array in (np.array([print], object), np.zeros(1, fields)):
+        np.savez(path, array)
+        with pytest.raises(CheckpointError, match=r"damaged: it holds more than plain arrays of numbers$"):
+            checkpoint.load_policy(path)
 
 
 def test_policy_that_cannot_be_written(tmp_path: Path, learner: LearnerState) -> None:

@@ -5,24 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny import tiny
 
 from hasrl_jax.collect.mjx import Statistics, mjx_record
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.runs.fields import FIELDS, name_of
 from hasrl_jax.train.loop import train
 
-TINY = {
-    "task": "cartpole",
-    "total_env_steps": 256,
-    "physics": {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"},
-    "network": {"hidden_size": 8, "initial_log_std": -1.0},
-    "collect": {
-        **{"num_workers": 1, "envs_per_worker": 4, "env_steps_per_iteration": 128, "unroll_length": 16},
-        **{"max_episode_steps": 40},
-    },
-    "ppo": {"epochs": 1, "minibatch_trajectories": 8},
-    "evaluate": {"every_iterations": 1, "episodes": 1},
-}
+TINY = tiny(
+    total_env_steps=256,
+    collect={"num_workers": 1, "envs_per_worker": 4},
+    evaluate={"every_iterations": 1, "episodes": 1},
+)
 
 
 @pytest.fixture(scope="module")

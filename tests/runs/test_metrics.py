@@ -11,10 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 
 from hasrl_jax.errors import RunError
+from hasrl_jax.runs import metrics
 from hasrl_jax.runs.metrics import MetricsWriter, ProgressPrinter, progress_line, tag
+
+TORN = [b'{"iteration": 4, "entr\n', b"\0\0\0\n", b'"text"\n', b"[]\n", b"\n"]
 
 
 def records(run: Path) -> list[dict]:
@@ -91,6 +96,41 @@ def test_torn_last_line_is_cut(tmp_path: Path, torn: bytes) -> None:
         file.write(torn)
     write(tmp_path, range(4, 5), start=9)
     assert [record["iteration"] for record in records(tmp_path)] == [1, 2, 3, 4]
+
+
+@given(
+    lines=st.lists(
+        st.one_of(st.integers(0, 9).map(lambda n: b'{"iteration": %d, "x": [1]}\n' % n), st.sampled_from(TORN))
+    ),
+    torn=st.sampled_from([b"", *TORN]),
+    iteration=st.integers(0, 9),
+    block=st.integers(1, 60),
+)
+def test_the_end_of_an_iteration_is_found_from_either_side(
+    lines: list[bytes], torn: bytes, iteration: int, block: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("metrics") / "metrics.jsonl"
+    path.write_bytes(b"".join([*lines, torn.rstrip(b"\n")]))
+    expected = position = 0
+    for line in path.read_bytes().splitlines(keepends=True):  # from the beginning
+        position += len(line)
+        if line.startswith(b'{"iteration": ') and line.endswith(b"}\n") and line[14] - ord("0") <= iteration:
+            expected = position
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(metrics, "_BLOCK", block)
+        assert metrics._end_of_iteration(path, iteration) == expected
+
+
+def test_a_long_run_is_resumed_from_the_end_of_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [json.dumps({"iteration": n, "entropy": n / 3}).encode() + b"\n" for n in range(1, 100_001)]
+    (tmp_path / "metrics.jsonl").write_bytes(b"".join(lines))
+    parsed: list[bytes] = []
+    loads = json.loads
+    monkeypatch.setattr(json, "loads", lambda line: parsed.append(line) or loads(line))
+    write(tmp_path, range(99_996, 99_998), start=99_995)
+    assert len(parsed) == 6  # the five that are cut, and the one before
+    monkeypatch.undo()
+    assert [record["iteration"] for record in records(tmp_path)] == list(range(1, 99_998))
 
 
 def test_disk_full(tmp_path: Path) -> None:

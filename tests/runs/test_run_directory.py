@@ -191,6 +191,14 @@ def test_directory_that_cannot_be_made(tmp_path: Path) -> None:
             open_run(config_for(tmp_path / name), resume=False).__enter__()
 
 
+def test_a_path_that_the_language_of_the_system_cannot_spell_is_one_line(tmp_path: Path) -> None:
+    name = "ü".encode().decode("ascii", "surrogateescape")  # as Python reads it where only ASCII is known
+    with pytest.raises(RunError, match=r"udcc3.*: checkpoints need a path in UTF-8; set PYTHONUTF8=1") as caught:
+        open_run(config_for(tmp_path / name), resume=False).__enter__()
+    str(caught.value).encode()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not bind the superuser")
 def test_no_write_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import two_processes
+from tiny import tiny_yaml
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.train import main as train_main
@@ -27,16 +28,7 @@ from hasrl_jax.train import distributed
 from hasrl_jax.train import loop as train
 
 SCRIPT = Path(two_processes.__file__)
-TINY = """
-task: cartpole
-physics: {timestep_s: 0.005, steps_per_env_step: 5, integrator: Euler}
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 1, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 2, minibatch_trajectories: 8}
-evaluate: {every_iterations: 2, episodes: 2}
-checkpoint: {every_iterations: 2}
-total_env_steps: 256
-"""
+TINY = tiny_yaml(collect={"num_workers": 1}, ppo={"epochs": 2}, total_env_steps=256)
 
 
 def free_address() -> str:

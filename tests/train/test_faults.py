@@ -12,6 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.errors import CheckpointError, RunError
@@ -20,15 +21,7 @@ from hasrl_jax.runs.metrics import MetricsWriter
 from hasrl_jax.train import loop
 
 ROOT = Path(__file__).parents[2]
-TINY = """
-task: cartpole
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 2, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-evaluate: {every_iterations: 0, episodes: 2}
-checkpoint: {every_iterations: 2}
-total_env_steps: 512
-"""
+TINY = tiny_yaml(evaluate={"every_iterations": 0})
 FOREVER = ("--total-env-steps", 10**9)
 
 
@@ -206,3 +199,36 @@ def test_a_setting_that_changes_what_the_parameters_mean_is_refused(
     assert train_main(["--resume", run, f"--network.{option}", value]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith(f"error: network.{option.replace('-', '_')}: got {value}; this run has learnt with")
+
+
+# Run by every interpreter at its start, those of the workers too.
+JUMPING_CLOCK = """
+import itertools, time
+read, jumps = time.time, itertools.cycle([0, 4e7, -4e7])
+time.time = lambda: read() + next(jumps)
+"""
+
+
+def test_a_clock_that_jumps_by_a_year_and_a_cache_that_cannot_be_written_cost_nothing(
+    tiny: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(JUMPING_CLOCK)
+    (tmp_path / "cache" / "hasrl_jax").mkdir(parents=True)
+    (tmp_path / "cache" / "hasrl_jax" / "compiled").symlink_to("/proc/sys")  # where nobody can make files, root neither
+    changed = {"PYTHONPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    options = ("--schedule", "overlap", "--collect.worker-timeout-s", 2)
+    command = train("--config", tiny, "--run-dir", tmp_path / "run", *options)
+    done = subprocess.run(
+        command, env=environment() | changed, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    record = last_record(tmp_path / "run")
+    assert (record["iteration"], record["workers_lost"]) == (4, 0)
+
+
+def test_too_few_open_files_are_one_line(tiny: Path, tmp_path: Path) -> None:
+    command = ["bash", "-c", f"ulimit -n 20; exec {' '.join(train('--config', tiny, '--run-dir', tmp_path / 'run'))}"]
+    done = subprocess.run(command, env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("error: at most 20 files may be open at once; expected 64 or more")

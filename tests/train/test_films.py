@@ -8,18 +8,16 @@ from pathlib import Path
 
 import imageio_ffmpeg
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.visualize import opengl
 
-TINY = """
-task: cartpole
-network: {hidden_size: 8}
-collect: {num_workers: 1, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-evaluate: {every_iterations: 0}
-video: {every_iterations: 2, seconds: 0.5, width: 64, height: 64}
-total_env_steps: 384
-"""
+TINY = tiny_yaml(
+    collect={"num_workers": 1},
+    evaluate={"every_iterations": 0},
+    video={"every_iterations": 2, "seconds": 0.5, "width": 64, "height": 64},
+    total_env_steps=384,
+)
 
 
 def train(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import psutil
 import pytest
+from tiny import tiny
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.collect.backends import make_collector
@@ -25,22 +26,15 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.learn import distributions, normalize, ppo
 from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.train import loop as train
+from hasrl_jax.types import Trajectory
 
 SCHEDULES = ("sync", "overlap", "decoupled")
 STEPS = 128  # environment steps of an iteration
-TINY = {
-    "task": "cartpole",
-    "total_env_steps": 10**9,
-    "physics": {"timestep_s": 0.005, "steps_per_env_step": 5, "integrator": "Euler"},
-    "network": {"hidden_size": 8, "initial_log_std": -1.0},
-    "collect": {
-        **{"num_workers": 2, "envs_per_worker": 2, "env_steps_per_iteration": STEPS, "unroll_length": 16},
-        **{"max_episode_steps": 40, "worker_timeout_s": 2.0},
-    },
-    "ppo": {"epochs": 1, "minibatch_trajectories": 8},
-    "evaluate": {"every_iterations": 0},
-    "checkpoint": {"every_iterations": 2},
-}
+TINY = tiny(
+    total_env_steps=10**9,
+    collect={"env_steps_per_iteration": STEPS, "worker_timeout_s": 2.0},
+    evaluate={"every_iterations": 0},
+)
 Hook = Callable[[dict], None]
 
 
@@ -237,28 +231,35 @@ def test_a_worker_that_raises_is_named_and_replaced(schedule, run, monkeypatch, 
 
 
 class Failing:
-    """An update that fails in its fourth call."""
+    """An update that fails in its fourth call: raises, or is given a step with a number that spoils it."""
 
-    def __init__(self, update: ppo.Update, error: Exception | None):
+    def __init__(self, update: ppo.Update, error: Exception | tuple[str, float]):
         self.update, self.error, self.calls = update, error, 0
 
-    def __call__(self, *args: object) -> tuple[ppo.LearnerState, dict]:
+    def __call__(self, learner: ppo.LearnerState, trajectory: Trajectory, *args: object) -> tuple:
         self.calls += 1
-        learner, metrics = self.update(*args)
         if self.calls == 4:
-            if self.error:
+            if isinstance(self.error, Exception):
                 raise self.error
-            metrics = metrics | {"parameters_finite": 0.0}
-        return learner, metrics
+            name, number = self.error
+            values = np.array(getattr(trajectory, name))
+            assert trajectory.mask[0, 0]
+            values[0, 0] = number
+            trajectory = trajectory._replace(**{name: values})
+        return self.update(learner, trajectory, *args)
+
+
+NOT_FINITE = "error: iteration 4: the update gave parameters that are not finite"
 
 
 @pytest.mark.parametrize(
     ("error", "cause"),
     [
-        (None, "error: iteration 4: the update gave parameters that are not finite"),
+        (("reward", np.nan), NOT_FINITE),
+        (("observation", 1e30), NOT_FINITE),  # its square is not finite: the statistics would be blind for ever
         (jax.errors.JaxRuntimeError("INTERNAL: device lost\nmore"), "the update failed (INTERNAL: device lost)"),
     ],
-    ids=["not finite", "exception"],
+    ids=["loss", "statistics", "exception"],
 )
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_a_learner_that_fails_leaves_one_cause_and_a_checkpoint(schedule, error, cause, run, tmp_path, capsys):

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.cli import sweep
 from hasrl_jax.cli.main import main
@@ -12,14 +13,7 @@ from hasrl_jax.visualize.sweep_page import Trial, page
 
 optuna = pytest.importorskip("optuna")
 
-TINY = """
-task: cartpole
-network: {hidden_size: 8}
-collect: {num_workers: 1, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-evaluate: {every_iterations: 0}
-total_env_steps: 256
-"""
+TINY = tiny_yaml(collect={"num_workers": 1}, evaluate={"every_iterations": 0}, total_env_steps=256)
 SPACE = (
     "ppo.clip: {uniform: [0.1, 0.3]}\nppo.policy_learning_rate: {log: [1.0e-5, 1.0e-2]}\nppo.epochs: {choice: [1, 2]}\n"
 )

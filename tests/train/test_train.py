@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.train import main as train_main
@@ -24,16 +25,7 @@ from hasrl_jax.policy.loading import load_policy_parameters
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 # Small enough to compile and run in seconds; two workers, two environments each.
-TINY = """
-task: cartpole
-physics: {timestep_s: 0.005, steps_per_env_step: 5, integrator: Euler}
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 2, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 2, minibatch_trajectories: 8}
-evaluate: {every_iterations: 2, episodes: 2}
-checkpoint: {every_iterations: 2}
-total_env_steps: 512
-"""
+TINY = tiny_yaml(ppo={"epochs": 2})
 METRICS = {
     *("iteration", "env_steps", "episode_return_train", "eval_return", "episode_length_train"),
     *("eval_length", "ratio_mean", "entropy", "actor_loss", "critic_loss", "approx_kl", "clip_fraction"),

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from tiny import tiny_yaml
 
 from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.cli.train import main as train_main
@@ -21,18 +22,13 @@ from hasrl_jax.train import loop as train
 
 ROOT = Path(__file__).parents[2]
 STEPS = 256  # environment steps of an iteration
-TINY = """
-task: cartpole
-backend: mjx
-physics: {timestep_s: 0.005, steps_per_env_step: 2, integrator: Euler}
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 1, envs_per_worker: 4, env_steps_per_iteration: 256, unroll_length: 16, max_episode_steps: 12}
-mjx: {num_envs: 16}
-ppo: {epochs: 1, minibatch_trajectories: 8}
-evaluate: {every_iterations: 2, episodes: 2}
-checkpoint: {every_iterations: 1, keep: 9}
-total_env_steps: 512
-"""
+TINY = tiny_yaml(
+    backend="mjx",
+    physics={"steps_per_env_step": 2},
+    collect={"num_workers": 1, "envs_per_worker": 4, "env_steps_per_iteration": 256, "max_episode_steps": 12},
+    mjx={"num_envs": 16},
+    checkpoint={"every_iterations": 1, "keep": 9},
+)
 ONLY_POOL, ONLY_MJX = {"workers_lost"}, {"contact_overflow", "constraint_overflow"}
 
 

@@ -9,20 +9,12 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tiny import tiny_yaml
 
 if importlib.util.find_spec("ray") is None:
     pytest.skip('Ray is not installed: pip install "ray>=2.52"', allow_module_level=True)
 
-TINY = """
-task: cartpole
-physics: {timestep_s: 0.005, steps_per_env_step: 5, integrator: Euler}
-network: {hidden_size: 8, initial_log_std: -1.0}
-collect: {num_workers: 2, envs_per_worker: 2, env_steps_per_iteration: 128, unroll_length: 16, max_episode_steps: 40}
-ppo: {epochs: 2, minibatch_trajectories: 8}
-evaluate: {every_iterations: 0}
-checkpoint: {every_iterations: 2}
-total_env_steps: 256
-"""
+TINY = tiny_yaml(ppo={"epochs": 2}, evaluate={"every_iterations": 0}, total_env_steps=256)
 
 
 def untimed(run: Path, count: int) -> list[dict]:

@@ -89,7 +89,7 @@ def test_falls_begin_another_episode_and_are_counted(live: Live) -> None:
     assert dict(readout(live.view(), live.commands, 1.0))["falls"].endswith("the last episode ended: fell")
 
 
-def test_a_randomised_robot_has_steps_of_its_own(live: Live) -> None:
+def test_a_randomized_robot_has_steps_of_its_own(live: Live) -> None:
     live.advance(Controls(reset=True))
     assert live.step_s == pytest.approx(0.025)
     durations = set()

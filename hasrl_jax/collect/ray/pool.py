@@ -1,4 +1,4 @@
-"""The workers of `cpu_pool.py` as Ray actors, on this machine or on the nodes of a Ray cluster.
+"""The workers of `collect/supervisor.py` as Ray actors, on this machine or on the nodes of a Ray cluster.
 
 Parameters go into Ray's object store once per iteration and trajectories come back through it: on the same node
 without a copy. Ray's own restarts are not used, since a lost worker is counted, and begins new episodes.
@@ -18,7 +18,7 @@ from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
 from hasrl_jax.collect.ray.cluster import connect, environment, import_ray
 from hasrl_jax.collect.ray.worker import RayWorker
-from hasrl_jax.collect.supervisor import MAX_FAILURES
+from hasrl_jax.collect.supervisor import MAX_FAILURES, are_of_all_workers, warn_unless_loaded
 from hasrl_jax.config.convert import to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.task import Task
@@ -142,17 +142,15 @@ class RayPool:
 
     def load(self, states: list[bytes]) -> None:
         """Restores what `save` returned; environments that differ in number begin new episodes instead."""
-        if len(states) != self.plan.num_workers:
-            if states:
-                log.warning("%d workers saved, %d run: all episodes begin anew", len(states), self.plan.num_workers)
+        if not are_of_all_workers(states, self.plan.num_workers):
             return
         requests = {index: self._actors[index].load.remote(states[index]) for index in self.places}
         for index, request in requests.items():
             loaded, failure = self._receive(index, request)
             if failure is not None:
                 self._replace(index, failure)
-            elif states[index] and not loaded:
-                log.warning("worker %d: the saved environments have other sizes; its episodes begin anew", index)
+            else:
+                warn_unless_loaded(index, states[index], loaded)
 
     def configure(self, config: Config) -> None:
         """Changes the settings of the task in every worker; only between `finish` and `start`."""

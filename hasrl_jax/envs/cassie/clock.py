@@ -59,8 +59,8 @@ def _bump(phase: Array, swing: Array, xp: Any) -> Array:
     rise_start = -EDGE * stance
     fall_start = length - EDGE * length
     # The rise straddles the start of the cycle: look at it from the nearest period.
-    centred = xp.where(phase > 0.5 + 0.5 * length, phase - 1.0, phase)
-    return _smoothstep((centred - rise_start) / width, xp) - _smoothstep((centred - fall_start) / width, xp)
+    centered = xp.where(phase > 0.5 + 0.5 * length, phase - 1.0, phase)
+    return _smoothstep((centered - rise_start) / width, xp) - _smoothstep((centered - fall_start) / width, xp)
 
 
 def _smoothstep(u: Array, xp: Any) -> Array:

@@ -32,6 +32,8 @@ HEIGHT = Told("height", "height_m", Entry("height_command", "m", SAME, mean=0.9,
 # In the order of the numbers in a command.
 COMMANDS = {"world": (FORWARD, LATERAL), "heading": (FORWARD, LATERAL, YAW_RATE, HEIGHT)}
 ARROW_KEYS = {"world": ("up-down", "left-right"), "heading": ("up-down", "", "left-right", "")}
+# Places in a command of either frame: both speeds, and in the heading frame the yaw rate behind them.
+PLANAR, MOTION = slice(0, 2), slice(0, 3)
 
 
 def num_uniforms(config: CommandConfig) -> int:
@@ -79,7 +81,7 @@ def _draw_in_world(uniforms: Array, config: CommandConfig, _: float, xp: Any) ->
 def _draw_in_heading(uniforms: Array, config: CommandConfig, usual_height_m: float, xp: Any) -> Array:
     """A stand, a straight walk, a turn or side-steps on the spot, or all at once: [..., 4].
 
-    Who is fast turns slowly and keeps the usual height.
+    The faster the robot walks, the less it is told to turn and to leave the usual height.
     """
     forward, lateral, yaw_rate, height = (
         between(uniforms[..., index], getattr(config, command.field))

@@ -214,7 +214,7 @@ def noise_size(config: CassieConfig) -> int:
 
 
 def player_constants(config: CassieConfig) -> dict[str, Any]:
-    """What who plays a policy elsewhere must know besides the observations and actions; see docs/deploy.md."""
+    """Constants, besides observations and actions, that a program needs to play a policy; see docs/deploy.md."""
     clock_fields = ["cycle_s", "cycle_per_speed_s", "quicken_above_m_s"]
     in_heading = config.command.frame == "heading"
     return {
@@ -432,10 +432,10 @@ def clock_signal(state: CassieState, xp: Any) -> Array:
 def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> CassieState:
     """`state` with the heading and the path to keep moved on by an environment step, which ended in `qpos`.
 
-    In the heading frame both wait for a robot that is too far off them: who is twisted or shoved away has to get its
-    speeds right from there on, not to return.
+    In the heading frame the error of both is bounded: a robot that was turned or pushed away goes on from where it is
+    at the commanded speeds, and need not return.
     """
-    config, moved = constants.config.command, state.command[..., :2] * state.env_step_s[..., None]
+    config, moved = constants.config.command, state.command[..., commands.PLANAR] * state.env_step_s[..., None]
     if config.frame == "world":
         return state._replace(path=state.path + moved)
     told = commands.named(state.command, config)
@@ -463,7 +463,7 @@ def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) 
     if config.command.frame == "world":
         return xp.zeros(command.shape[:-1], bool)
     slow = (velocity[..., :2] ** 2).sum(axis=-1) < config.clock.stand_below_m_s**2
-    return slow & (command[..., :3] == 0).all(axis=-1)
+    return slow & (command[..., commands.MOTION] == 0).all(axis=-1)
 
 
 def pelvis_orientation(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
@@ -507,7 +507,7 @@ def reward_errors(
     orientation = pelvis_orientation(constants, state, reading.qpos, xp)
     pelvis_error = 1.0 - orientation[..., 0] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
-    velocity_error = xp.abs(velocity[..., :2] - state.command[..., :2])
+    velocity_error = xp.abs(velocity[..., :2] - state.command[..., commands.PLANAR])
     speed_error = velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]
     if config.command.frame == "world":
         drift = reading.qpos[..., 1] - (state.path[..., 1] if settings.follow_lateral_command else 0.0)

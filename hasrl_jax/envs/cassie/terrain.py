@@ -76,7 +76,7 @@ def model_fields(uniforms: Array, model: mujoco.MjModel, config: TerrainConfig, 
 
     Returns:
       `geom_pos` and `geom_size` [..., ngeom, 3], and `bvh_aabb` [..., nbvh, 6]: the boxes around groups of geoms
-      (centre, half sizes) by which MuJoCo finds contacts, along z wide enough for every height.
+      (center, half sizes) by which MuJoCo finds contacts, along z wide enough for every height.
     """
     if config.kind == "flat":
         return {}
@@ -97,10 +97,10 @@ def model_fields(uniforms: Array, model: mujoco.MjModel, config: TerrainConfig, 
 
     up = xp.stack([xp.zeros_like(height), xp.zeros_like(height), height], axis=-1)
     pos = scaled(model.geom_pos, len(boxes), start) + up
-    centre = scaled(model.bvh_aabb[:, :3], nodes, start)
+    center = scaled(model.bvh_aabb[:, :3], nodes, start)
     half = scaled(model.bvh_aabb[:, 3:], nodes, 0.0)
     highest = max(abs(end) for end in config.step_height_m) * (FLIGHT if config.kind == "steps" else 1)
-    bounds = xp.concatenate([centre, half + np.array([0.0, 0.0, highest])], axis=-1)
+    bounds = xp.concatenate([center, half + np.array([0.0, 0.0, highest])], axis=-1)
     return {
         "geom_pos": complete(pos, model.geom_pos),
         "geom_size": complete(scaled(model.geom_size, len(boxes), 0.0), model.geom_size),
