@@ -94,7 +94,10 @@ def _load(name: str, place: str) -> TaskSpec:
     try:
         spec = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"task: got {shown(name)}, which cannot be loaded from {place} ({error})") from None
+        raise ConfigError(
+            f"task: got {shown(name)}, which cannot be loaded from {place} ({error}); "
+            "expected a module in the working directory, on PYTHONPATH or installed"
+        ) from None
     if not isinstance(spec, TaskSpec):
         raise ConfigError(f"task: got {shown(name)}; {place} is no TaskSpec but {shown(spec)}")
     taken = {field.name for field in dataclasses.fields(Config)}
