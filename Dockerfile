@@ -17,7 +17,9 @@ COPY configs configs
 COPY hasrl_jax hasrl_jax
 RUN pip install hatchling==1.33.0 && pip install --no-deps --no-build-isolation . && hasrl --version
 
-RUN useradd --create-home hasrl && install -d -o hasrl /work
+# Whoever runs it (docker run --user) can write below /work, caches included.
+RUN useradd --no-create-home hasrl && install -d -m 1777 /work
+ENV HOME=/work
 USER hasrl
 WORKDIR /work
 ENTRYPOINT ["hasrl"]

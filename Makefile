@@ -43,7 +43,8 @@ wheel:  ## wheel and sdist in dist/, checked, installed in an empty environment 
 COMPILE := uv pip compile --universal --python-version 3.11 --no-header --no-annotate pyproject.toml
 EXTRAS := $(foreach name,cuda deploy dev docs menagerie mutation ray release viewer,--extra $(name))
 
-lock:  ## after a change of dependencies in pyproject.toml; the extra `compare` is left to the platform's torch
+# Left out: `compare` and `frameworks`, whose torch is the platform's, and `mlflow`, `sweep` and `wandb`.
+lock:  ## after a change of dependencies in pyproject.toml
 	$(BIN)/pip install uv
 	$(BIN)/$(COMPILE) $(EXTRAS) -o requirements.lock
 	$(BIN)/$(COMPILE) -c requirements.lock --generate-hashes --extra viewer -o docker/requirements-cpu.lock

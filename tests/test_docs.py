@@ -1,4 +1,4 @@
-"""The documents name files, functions and settings that exist."""
+"""The documents name files, functions, settings, programs and options that exist."""
 
 import ast
 import dataclasses
@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 import hasrl_jax
-from hasrl_jax.config.convert import from_dict
+from hasrl_jax.cli.completion import OWN
+from hasrl_jax.cli.main import PROGRAMS
+from hasrl_jax.cli.parsing import SHORTHAND, options_of_fields
+from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.runs.directory import CONFIG_FILE
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -25,6 +28,8 @@ DOCUMENTS = (
     *(f"docs/policies/{name}.md" for name in ("index", "released", "released-steer", "released-stairs")),
 )
 FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")
+COMMAND = re.compile(r"(?:\bhasrl |-m hasrl_jax\.)([a-z]+) ([^|#;&`\n]*)")
+OPTION = re.compile(r"(?<!\S)--[a-z][\w.-]*")
 NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 PLACES = (ROOT, PACKAGE, ROOT / "docs", ROOT / "tests")
 
@@ -101,3 +106,33 @@ def test_every_setting_named_exists() -> None:
             name = span.partition(":")[0].strip()
             if re.fullmatch(r"[a-z]+(\.[a-z_0-9]+)+", name) and name.split(".")[0] in groups | {"cassie"}:
                 assert _is_setting(name), f"{document}: `{span}`"
+
+
+def _commands(text: str) -> list[tuple[str, list[str]]]:
+    """(program, its options) of every command in a block of code or between backticks."""
+    blocks = re.findall(r"```.*?```", text, flags=re.DOTALL)
+    shown = "\n".join([*blocks, *_spans(text)]).replace("\\\n", " ")
+    return [(program, OPTION.findall(rest)) for program, rest in COMMAND.findall(shown)]
+
+
+def _options(program: str) -> set[str]:
+    """What the source of a program, and of what all of them share, calls an option."""
+    files = [PACKAGE / "cli" / f"{program}.py", PACKAGE / "cli" / "options.py"]
+    files += PACKAGE.glob("bench/*.py") if program == "bench" else []
+    return {name for file in files for name in re.findall(r'"(--[a-z][\w-]*)"', file.read_text())}
+
+
+def test_every_program_and_option_named_exists() -> None:
+    fields = {*options_of_fields(to_dict(from_dict({"task": "cassie"}))), *OWN, *SHORTHAND}
+    seen = 0
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*/*.md")]:
+        text = path.read_text(encoding="utf-8")
+        if '```python title="' in text:  # brings options of its own; tests/test_tutorials.py runs its commands
+            continue
+        for program, options in _commands(text):
+            assert program in PROGRAMS, f"{path}: hasrl {program}"
+            known = _options(program) | fields
+            for option in options:
+                seen += 1
+                assert option.replace("_", "-") in known, f"{path}: hasrl {program} {option}"
+    assert seen > 100

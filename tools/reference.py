@@ -255,7 +255,7 @@ def command_lines() -> str:
     """What each program says of itself."""
     parts = [
         "# Command lines",
-        "`hasrl PROGRAM` and `python -m hasrl_jax.PROGRAM` are the same. Exit status: 0 done, 1 failed, 2 a value that "
+        "`hasrl PROGRAM` and `python -m hasrl_jax PROGRAM` are the same. Exit status: 0 done, 1 failed, 2 a value that "
         "cannot work, 130 interrupted.",
     ]
     for program, (module, summary) in PROGRAMS.items():

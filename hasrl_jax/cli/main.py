@@ -1,4 +1,4 @@
-"""`hasrl PROGRAM ...`: one program with sub-commands, the same as `python -m hasrl_jax.PROGRAM ...`."""
+"""`hasrl PROGRAM ...`: one program with sub-commands, the same as `python -m hasrl_jax PROGRAM ...`."""
 
 import contextlib
 import difflib

@@ -37,6 +37,7 @@ STUDY_FILE, PAGE_FILE = "study.db", "sweep.html"
 LAST_ITERATIONS = 10  # the value of a trial is the mean of its metric over so many of its last ones
 POLL_S = 0.5
 WARM_UP_TRIALS = 4  # whole trials before any is pruned
+FAILURES = 3  # in a row that end the sweep: a full disk fails every trial, and failed ones do not count as trials
 Space = dict[str, tuple[str, list[Any]]]  # field -> (kind, its bounds or choices)
 
 # kind -> (trial, field, values) -> value
@@ -52,7 +53,8 @@ def sweep(arguments: list[str]) -> None:
     """The command.
 
     Raises:
-      ConfigError: an impossible argument; RunError: every trial failed.
+      ConfigError: an impossible argument.
+      RunError: the first trial failed, or `FAILURES` in a row.
     """
     known, train_arguments = _parse(arguments)
     space = read_space(known.space)
@@ -74,7 +76,8 @@ def sweep(arguments: list[str]) -> None:
     states = optuna.trial.TrialState
     for trial in study.get_trials(deepcopy=False, states=(states.RUNNING,)):  # of a sweep that was ended
         study.tell(trial.number, state=states.FAIL)
-    while len(study.get_trials(deepcopy=False, states=(states.COMPLETE, states.PRUNED))) < known.trials:
+    failed = 0  # in a row
+    while (done := len(study.get_trials(deepcopy=False, states=(states.COMPLETE, states.PRUNED)))) < known.trials:
         trial = study.ask()
         trial_run = known.out / f"trial_{trial.number:04d}"
         trial.set_user_attr("run", str(trial_run))
@@ -89,8 +92,10 @@ def sweep(arguments: list[str]) -> None:
         print(
             f"trial {trial.number}: {outcome.name.lower()} {'' if value is None else format(value, '.4g')}", flush=True
         )
-        if outcome is states.FAIL and not study.get_trials(deepcopy=False, states=(states.COMPLETE, states.PRUNED)):
-            raise RunError(f"{trial_run}: the first trial failed; its output is in {trial_run}.log")
+        failed = failed + 1 if outcome is states.FAIL else 0
+        if failed and (not done or failed == FAILURES):
+            which = "the first trial" if not done else f"{FAILURES} trials in a row"
+            raise RunError(f"{trial_run}: {which} failed; the output is in {trial_run}.log")
     print(f"{known.out / PAGE_FILE}: best {study.best_value:.4g} with {study.best_params}")
 
 

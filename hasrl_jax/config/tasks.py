@@ -97,7 +97,10 @@ def _load(name: str, place: str) -> TaskSpec:
         spec = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ConfigError(f"task: got {shown(name)}, which cannot be loaded from {named(place)} ({reason})") from None
+        raise ConfigError(
+            f"task: got {shown(name)}, which cannot be loaded from {named(place)} ({reason}); "
+            "expected a module in the working directory, on PYTHONPATH or installed"
+        ) from None
     if not isinstance(spec, TaskSpec):
         raise ConfigError(f"task: got {shown(name)}; {place} is no TaskSpec but {shown(spec)}")
     taken = {field.name for field in dataclasses.fields(Config)}

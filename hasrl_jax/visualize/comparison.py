@@ -28,9 +28,10 @@ PANELS = (  # metric, title
 LAST = (*(metric for metric, _ in PANELS), "env_steps", "train_seconds")  # shown as numbers, too
 SCORES = (("share_up", "up to the end, %", 100.0), ("forward_speed_error", "speed error, m/s", 1.0))
 STYLE = (
-    "body{font:14px/1.4 sans-serif;margin:2em;max-width:80em}table{border-collapse:collapse;margin:.5em 0 1.5em}"
-    "td,th{padding:.2em .7em;border-bottom:1px solid #ddd;text-align:right}th:first-child,td:first-child"
-    "{text-align:left}img{max-width:100%}code{background:#f3f3f3}"
+    ":root{color-scheme:light dark}body{font:14px/1.4 sans-serif;margin:2em auto;padding:0 1em;max-width:80em}"
+    "table{display:block;overflow-x:auto;border-collapse:collapse;margin:.5em 0 1.5em}"
+    "td,th{padding:.2em .7em;border-bottom:1px solid #8886;text-align:right}th:first-child,td:first-child"
+    "{text-align:left}img{max-width:100%}code{background:#8883}"
 )
 MISSING = "–"
 
@@ -85,10 +86,13 @@ def page(runs: list[RunData]) -> str:
         sections.append(("Scorecards", f"<p>None yet: <code>{html.escape(hint)}</code></p>"))
     body = "".join(f"<h2>{title}</h2>{content}" for title, content in sections)
     title = html.escape(" · ".join(path.name for path in (run.path for run in runs)))
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-        f"<h1>{title}</h1>{body}</html>\n"
-    )
+    return document(title, f"<h1>{title}</h1>{body}")
+
+
+def document(title: str, body: str) -> str:
+    """A page of HTML that needs nothing outside it, for narrow windows too."""
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    return f'<!doctype html><html lang="en">{head}<title>{title}</title><style>{STYLE}</style>{body}</html>\n'
 
 
 def table(heading: list[str], rows: list[list[str]]) -> str:

@@ -6,7 +6,7 @@ import io
 from typing import NamedTuple
 
 from hasrl_jax.evaluate.palette import COLORS
-from hasrl_jax.visualize.comparison import MISSING, STYLE, table
+from hasrl_jax.visualize.comparison import MISSING, document, table
 
 PANELS_A_ROW = 4
 
@@ -45,8 +45,7 @@ def page(metric: str, maximize: bool, trials: list[Trial]) -> str:
         parts.append(f"<code>{html.escape(options)}</code></p>")
         parts.append(f'<img alt="settings" src="data:image/png;base64,{_picture(metric, names, finished)}">')
     parts.append(table(["trial", "state", metric, *names, "run"], rows))
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Sweep</title><style>{STYLE}</style>'
-    return head + "".join(parts) + "</html>\n"
+    return document("Sweep", "".join(parts))
 
 
 def _picture(metric: str, names: list[str], trials: list[Trial]) -> str:

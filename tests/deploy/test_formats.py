@@ -85,7 +85,7 @@ def test_a_file_acts_as_the_equations_say(
             np.testing.assert_allclose(action, wanted, atol=1e-5)
 
 
-@pytest.mark.parametrize("policy", ["released", "released-steer"])
+@pytest.mark.parametrize("policy", loading.RELEASED)
 @pytest.mark.parametrize("form", ["npz", "onnx", "jax"])
 def test_a_released_policy_is_exported_and_agrees_for_a_thousand_steps(tmp_path, capsys, policy, form):
     out = tmp_path / f"policy{export.SUFFIXES[form]}"

@@ -51,6 +51,9 @@ def test_the_machine_counts_the_processes_of_the_run() -> None:
         (["hasrl", "train", "--cassie.reward.hip"], "--cassie.reward.hip-roll", "--cassie.reward.scale"),
         (["hasrl", "train", "--config", "smo"], "smoke", "paper"),
         (["hasrl", "train", "--task", "cart"], "cartpole", "cassie"),
+        (["hasrl", "evaluate", "--s"], "--scorecard", "--stages"),
+        (["hasrl", "viewer", "--policy", "released-s"], "released-steer", "released"),
+        (["hasrl", "sweep", "--s"], "--space", "--scorecard"),
     ],
 )
 def test_bash_completes(typed: list[str], expected: str, never: str) -> None:

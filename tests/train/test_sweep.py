@@ -65,6 +65,19 @@ def test_a_pruned_trial_is_stopped_and_can_be_continued(tmp_path: Path) -> None:
     assert [iteration for _, iteration in trial.reports] == sorted({iteration for _, iteration in trial.reports})
 
 
+def test_a_sweep_whose_trials_fail_again_and_again_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    states = optuna.trial.TrialState
+    outcomes = iter([(states.COMPLETE, 1.0), (states.FAIL, None), (states.COMPLETE, 2.0), *3 * [(states.FAIL, None)]])
+    monkeypatch.setattr(sweep, "train_trial", lambda *_: next(outcomes))
+    (tmp_path / "space.yaml").write_text("ppo.clip: {uniform: [0.1, 0.3]}\n")
+    out = tmp_path / "sweep"
+    assert main(["sweep", "--space", str(tmp_path / "space.yaml"), "--out", str(out), "--trials", "9"]) == 1
+    assert f"{out / 'trial_0005'}: 3 trials in a row failed" in capsys.readouterr().err
+    assert next(outcomes, None) is None
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [

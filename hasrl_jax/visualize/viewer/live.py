@@ -13,6 +13,7 @@ from hasrl_jax.config import tasks
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import CollectConfig, Config
+from hasrl_jax.envs import frames
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.model import load_model
 from hasrl_jax.envs.registry import Robot
@@ -29,7 +30,7 @@ class Push(NamedTuple):
     """A horizontal force on the robot, for as long as its task's pushes last."""
 
     force_n: float
-    direction_deg: float  # 0 pushes along the world's x, 90 along its y
+    direction_deg: float  # asked for: from where the robot faces, 90 to its left; seen: the same from the world's x
 
 
 class Controls(NamedTuple):
@@ -97,9 +98,10 @@ class Live:
             self._episode = self._begin(controls.randomized)
         episode = self._episode
         if controls.push:
-            angle = np.deg2rad(controls.push.direction_deg)
-            episode.player.env.push(controls.push.force_n * np.cos(angle), controls.push.force_n * np.sin(angle))
-            episode.push, episode.push_left_s = controls.push, self._push_s
+            push = controls.push._replace(direction_deg=controls.push.direction_deg + self._facing_deg())
+            angle = np.deg2rad(push.direction_deg)
+            episode.player.env.push(push.force_n * np.cos(angle), push.force_n * np.sin(angle))
+            episode.push, episode.push_left_s = push, self._push_s
         if controls.paused:
             return
         if self.commands and controls.command != episode.command:
@@ -123,8 +125,7 @@ class Live:
         episode = self._episode
         env = episode.player.env
         env.place_ground(self.model)
-        self._data.qpos[:] = env.qpos
-        mujoco.mj_kinematics(self.model, self._data)
+        self._pose()
         return View(
             qpos=env.qpos.copy(),
             position=self._data.xpos.copy(),
@@ -137,6 +138,16 @@ class Live:
             push=episode.push,
             randomized=episode.randomized,
         )
+
+    def _pose(self) -> None:
+        """Where the bodies of the robot are now."""
+        self._data.qpos[:] = self._episode.player.env.qpos
+        mujoco.mj_kinematics(self.model, self._data)
+
+    def _facing_deg(self) -> float:
+        """How far the robot has turned to the left of the world's x."""
+        self._pose()
+        return float(np.rad2deg(frames.heading(self._data.xquat[1], np)))
 
     def _begin(self, randomized: bool) -> "Episode":
         randomized = randomized and self.can_randomize
