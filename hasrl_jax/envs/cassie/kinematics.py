@@ -135,12 +135,12 @@ def _turns(axis: np.ndarray, angle: Array, xp: Any) -> Array:
     return np.eye(3) + xp.sin(angle)[..., None, None] * skew + (1 - xp.cos(angle))[..., None, None] * (skew @ skew)
 
 
-def height(chain: Legs, angle: Array, turning: Array, quat: Array, xp: Any) -> Array:
+def height(chain: Legs, angle: Array, quat: Array, xp: Any) -> Array:
     """Height of the pelvis above the soles that stand, counted as that above level ground is, m, [...].
 
     Args: as those of `estimate`.
     """
-    return _above(chain, angle, xp.zeros_like(angle), turning, quat, xp)[0]
+    return _above(chain, angle, xp.zeros_like(angle), xp.zeros_like(quat[..., 1:]), quat, xp)[0]
 
 
 def estimate(

@@ -278,7 +278,7 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     )
     if constants.legs is not None:  # a robot that was blind before the episode, too, knows its velocity
         angle = encoders(constants, state, qpos, xp)
-        above = kinematics.height(constants.legs, angle, qvel[..., 3:6], qpos[..., 3:7], xp)
+        above = kinematics.height(constants.legs, angle, qpos[..., 3:7], xp)
         state = state._replace(estimate=xp.concatenate([above[..., None], qvel[..., :3]], axis=-1))
     # Nothing accelerates yet, so the first observation needs no physics.
     observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), noise_u, xp)
