@@ -166,7 +166,8 @@ def write(
     for name, (config, parameters) in policies.items():
         digest = _digest(config, parameters, trials, seed)
         known = earlier.get("policies", {}).get(name, {})
-        report["policies"][name] = known if known.get("digest") == digest else {"digest": digest, "rows": []}
+        fresh = {"digest": digest, "observe": config.settings.observe, "rows": []}
+        report["policies"][name] = known if known.get("digest") == digest else fresh
     for name, (config, parameters) in policies.items():
         measured, started = report["policies"][name]["rows"], time.monotonic()
         chosen = rows()[len(measured) :]
@@ -210,9 +211,12 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
         f"{report['seed']}. A trial starts at rest 1 to 2.5 m before the first edge, up to {HEADING_RAD:g} rad askew "
         "where the policy keeps a heading, and succeeds when the pelvis is 0.5 m beyond the last edge of one flight, "
         "or 4 m beyond the first edge of other ground, in time and without a fall: a pelvis below 0.5 m above the mean "
-        "of the ground 0.3 m around it, or a tilt above 45°. Flights have 1 to 8 steps, 0.24 to 0.4 m deep, each off by "
-        "up to 1 cm in height. Slopes are up to 10° steep, rough blocks up to 5 cm high or low, the step down is one "
-        "of 15 cm. Every policy observes what it was trained with. In brackets: 95 % Wilson intervals.\n",
+        "of the ground 0.3 m around it, or a tilt above 45°. Flights have 1 to 8 steps, 0.24 to 0.4 m deep, each off "
+        "by up to 1 cm in height. Slopes are up to 10° steep, rough blocks up to 5 cm high or low, the step down is "
+        "one of 15 cm. In brackets: 95 % Wilson intervals.\n",
+        "Observations: "
+        + ", ".join(f"{name}, {policy['observe']}" for name, policy in report["policies"].items())
+        + ".\n",
         f"`{report['command']}`\n",
         "![Success by speed and by height of the steps](stairs.png)\n",
         "| trial | " + " | ".join(shares) + " |",

@@ -52,10 +52,7 @@ def test_a_trial_succeeds_on_the_landing(row: Row) -> None:
         table = np.repeat(state.task.terrain[env : env + 1], len(x), axis=0)
         height = stairs.terrain.height_at(x, table, np)
         edges = x[np.flatnonzero(np.diff(height))]
-        if row.ground == "slopes":
-            end = edges[0] + 4.0
-        else:
-            end = edges[np.argmax(np.diff(edges) > 2.0)] + 0.5
+        end = edges[0] + 4.0 if row.ground == "slopes" else edges[np.argmax(np.diff(edges) > 2.0)] + 0.5
         for place, expected in ((end - 0.05, False), (end + 0.05, True)):
             physics = state.physics.copy()
             physics[:, 1] = place

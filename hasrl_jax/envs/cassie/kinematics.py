@@ -95,6 +95,11 @@ def _chain(model: mujoco.MjModel, encoders: list[int], foot_joint: str) -> dict[
     return {name: np.array(values) for name, values in found.items()} | {"radius": model.geom_size[sole, 0]}
 
 
+def player_constants() -> dict[str, float]:
+    """What who plays a blind policy elsewhere must know of `estimate`."""
+    return {"unloaded_rad": UNLOADED_RAD, "bend_rad": BEND_RAD, "trust": TRUST}
+
+
 def _matrix(quat: np.ndarray) -> np.ndarray:
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quat)

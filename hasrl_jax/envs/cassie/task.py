@@ -226,6 +226,7 @@ def player_constants(config: CassieConfig) -> dict[str, Any]:
         "gravity_m_s2": GRAVITY_M_S2,
         "clock": {name: getattr(config.clock, name) for name in clock_fields + ["stand_below_m_s"] * in_heading},
         **({"heading": {"max_heading_error_rad": config.command.max_heading_error_rad}} if in_heading else {}),
+        **({"blind": kinematics.player_constants()} if config.observe == "blind" else {}),
         "fall": dataclasses.asdict(config.termination),
     }
 
