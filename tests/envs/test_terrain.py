@@ -52,7 +52,7 @@ def test_the_formula_is_what_a_ray_meets(kind: str, randomize: bool, more: dict[
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         x = np.concatenate([np.random.default_rng(episode).uniform(-20, 60, 300), [0.0, 0.999, 200.0]])
-        hit = [_ground_below(model, data, [at, y, 3.0]) for at, y in zip(x, np.linspace(-15, 15, len(x)), strict=True)]
+        hit = [_ground_below(model, data, [at, y, 30.0]) for at, y in zip(x, np.linspace(-15, 15, len(x)), strict=True)]
         expected = _height(x, fresh.state.terrain[episode])
         np.testing.assert_allclose(np.array(hit) - FLOOR_M, expected, atol=1e-9)
         assert not expected[x < 1.0].any()

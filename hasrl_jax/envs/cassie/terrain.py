@@ -113,6 +113,8 @@ def build(config: TerrainConfig, spec: mujoco.MjSpec) -> None:
         box.type = mujoco.mjtGeom.mjGEOM_BOX
         box.size = [(end - start) / 2, HALF_WIDTH_M, HALF_THICKNESS_M]
         box.pos = [(start + end) / 2, 0, top - HALF_THICKNESS_M]
+        if config.kind == "slopes":  # MuJoCo never reads the orientation of a geom that is compiled without one
+            box.quat = [1.0, 0.0, 1e-3, 0.0]
 
 
 def model_fields(ground: Array, model: mujoco.MjModel, config: TerrainConfig, xp: Any) -> dict[str, Array]:
