@@ -135,8 +135,7 @@ class TerrainConfig:
     flat_start_m: Annotated[float, Limits(0.5, 100)] = 1.0  # x at which the level ground of the start ends, m
     approach_m: Annotated[Range, Limits(0, 100)] = (0.0, 0.0)  # by how much further on it ends, a draw per episode, m
     level_share: Share = 0.0  # share of episodes whose ground is level all the same
-    # the reward and the termination count heights from the mean of the ground so far before and behind the pelvis, m;
-    # at 0 from the ground under it, which jumps at an edge
+    # reward and end count heights from the mean ground so far before and behind the pelvis, at 0 from under it, m
     average_m: Annotated[float, Limits(0, 2)] = 0.0
 
 
@@ -150,8 +149,7 @@ class TerminationConfig:
 
 @dataclass(frozen=True)
 class CassieConfig:
-    # state: the pelvis' height above the ground and its velocity as they are; blind: as encoders and IMU have them,
-    # see `envs/cassie/kinematics.py`
+    # height above the ground and velocity in the observation: state, the true ones; blind, what encoders and IMU give
     observe: Literal["state", "blind"] = "state"
     command: CommandConfig = field(default_factory=CommandConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
