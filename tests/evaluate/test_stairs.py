@@ -49,7 +49,8 @@ def test_a_trial_succeeds_on_the_landing(row: Row) -> None:
     state = envs.reset(np.random.default_rng(0))
     x = np.arange(0.0, 12.0, 1e-2)
     for env in range(30):
-        table = np.repeat(state.task.terrain[env : env + 1], len(x), axis=0)
+        ground = state.task.terrain[env]
+        table = np.broadcast_to(ground, (len(x), *ground.shape))
         height = stairs.terrain.height_at(x, table, np)
         edges = x[np.flatnonzero(np.diff(height))]
         end = edges[0] + 4.0 if row.ground == "slopes" else edges[np.argmax(np.diff(edges) > 2.0)] + 0.5
