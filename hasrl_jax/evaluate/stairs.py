@@ -162,7 +162,8 @@ def write(
     path = directory / "stairs.json"
     earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     physics_hz = 1 / next(iter(policies.values()))[0].physics.timestep_s
-    report = {"trials": trials, "seed": seed, "command": command, "physics_hz": physics_hz, "policies": {}}
+    report: dict[str, Any] = {"trials": trials, "seed": seed, "command": command, "physics_hz": physics_hz}
+    report["policies"] = {}
     for name, (config, parameters) in policies.items():
         digest = _digest(config, parameters, trials, seed)
         known = earlier.get("policies", {}).get(name, {})
@@ -241,8 +242,8 @@ def plot(shares: dict[str, dict[Row, dict[str, Any]]], path: Path) -> None:
     for axis, (way, key) in zip(axes, panels, strict=True):
         values = SPEEDS_M_S if key == "speed_m_s" else RISES_M
         for color, (name, found) in zip(COLORS * 9, shares.items(), strict=False):
-            points = [(value, found.get(Row(way, **{key: value}))) for value in values]
-            known = [(value, share) for value, share in points if share]
+            row_of = {value: Row(way)._replace(**{key: value}) for value in values}
+            known = [(value, found[row]) for value, row in row_of.items() if row in found]
             mean = [100 * share["mean"] for _, share in known]
             low = [100 * (share["mean"] - share["low"]) for _, share in known]
             high = [100 * (share["high"] - share["mean"]) for _, share in known]

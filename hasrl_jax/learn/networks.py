@@ -94,7 +94,8 @@ class Policy(nn.Module):
     memory: str = "lstm"
 
     def setup(self) -> None:
-        hidden, layers = self.hidden_size, []
+        hidden = self.hidden_size
+        layers: list[tuple[jax.Array, ...]] = []
         for layer, width in ((0, self.observation_size), (1, hidden)):
             if self.memory == "none":
                 kernel = self.param(f"dense_{layer}_kernel", nn.initializers.orthogonal(2.0**0.5), (width, hidden))
@@ -148,7 +149,7 @@ class Policy(nn.Module):
             is_first = None if is_first is None else is_first[:, None]
         batch, steps = observation.shape[:2]
         if carry is None:
-            carry = zero_carry(batch, self.hidden_size, self.mirror is not None, self.memory)
+            carry = jnp.asarray(zero_carry(batch, self.hidden_size, self.mirror is not None, self.memory))
         streams = [observation] if self.mirror is None else [observation, self.mirror.observation(observation)]
         count = len(streams)
         # Streams stand side by side on the batch axis, so a batch split over devices stays where it is.
