@@ -238,21 +238,22 @@ def plot(shares: dict[str, dict[Row, dict[str, Any]]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.2), layout="constrained", sharey=True)
-    panels = [(way, key) for key in ("speed_m_s", "rise_m") for way in ("up", "down")]
-    for axis, (way, key) in zip(axes, panels, strict=True):
-        values = SPEEDS_M_S if key == "speed_m_s" else RISES_M
+    panels = [(way, of_speed) for of_speed in (True, False) for way in ("up", "down")]
+    for axis, (way, of_speed) in zip(axes, panels, strict=True):
+        values = SPEEDS_M_S if of_speed else RISES_M
         for color, (name, found) in zip(COLORS * 9, shares.items(), strict=False):
-            row_of = {value: Row(way)._replace(**{key: value}) for value in values}
+            plain = Row(way)
+            row_of = {v: plain._replace(speed_m_s=v) if of_speed else plain._replace(rise_m=v) for v in values}
             known = [(value, found[row]) for value, row in row_of.items() if row in found]
             mean = [100 * share["mean"] for _, share in known]
             low = [100 * (share["mean"] - share["low"]) for _, share in known]
             high = [100 * (share["high"] - share["mean"]) for _, share in known]
-            scale = 1 if key == "speed_m_s" else 100
+            scale = 1 if of_speed else 100
             x = [scale * value for value, _ in known]
             axis.errorbar(x, mean, yerr=(low, high), label=name, color=color, marker="o", markersize=3)
-        fixed = f"steps of {100 * AT_RISE_M:g} cm" if key == "speed_m_s" else f"{AT_SPEED_M_S:g} m/s"
+        fixed = f"steps of {100 * AT_RISE_M:g} cm" if of_speed else f"{AT_SPEED_M_S:g} m/s"
         axis.set_title(f"{way}, {fixed}", fontsize=10)
-        axis.set_xlabel("commanded, m/s" if key == "speed_m_s" else "height of a step, cm")
+        axis.set_xlabel("commanded, m/s" if of_speed else "height of a step, cm")
         axis.set_ylim(-3, 103)
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("success, %")
