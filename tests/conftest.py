@@ -22,9 +22,9 @@ from hasrl_jax.policy.numpy_networks import parameter_shapes  # noqa: E402
 
 @pytest.fixture
 def make_config() -> Callable[..., Config]:
-    """`make_config(task, symmetric, **collect)`: a few environments, short episodes, narrow networks."""
+    """`make_config(task, symmetric, memory, **collect)`: a few environments, short episodes, narrow networks."""
 
-    def make(task: str = "cartpole", symmetric: bool = False, **collect: Any) -> Config:
+    def make(task: str = "cartpole", symmetric: bool = False, memory: str = "lstm", **collect: Any) -> Config:
         sizes = {
             "num_workers": 1,
             "envs_per_worker": 4,
@@ -33,7 +33,7 @@ def make_config() -> Callable[..., Config]:
             "max_episode_steps": 10,
             "worker_timeout_s": 20.0,
         }
-        network = {"hidden_size": 16, "symmetric": symmetric, "initial_log_std": -0.5}
+        network = {"memory": memory, "hidden_size": 16, "symmetric": symmetric, "initial_log_std": -0.5}
         return from_dict({"task": task, "network": network, "collect": sizes | collect})
 
     return make

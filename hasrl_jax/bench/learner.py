@@ -143,7 +143,7 @@ def random_trajectory(config: Config, rows: int, steps: int, observation_size: i
         truncated=last,
         bootstrap_value=noise(steps) * last,
         mask=np.ones((rows, steps), bool),
-        initial_carry=zero_carry(rows, config.network.hidden_size, config.network.symmetric),
+        initial_carry=zero_carry(rows, config.network.hidden_size, config.network.symmetric, config.network.memory),
         policy_version=np.zeros(rows, np.int32),
     )
 

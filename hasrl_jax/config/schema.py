@@ -35,7 +35,9 @@ class PhysicsConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    hidden_size: Annotated[int, Limits(1, 8192)] = 128  # width of each LSTM layer and of each value layer
+    # of the policy: two LSTM layers, or two tanh layers without memory, which show what the memory is for
+    memory: Literal["lstm", "none"] = "lstm"
+    hidden_size: Annotated[int, Limits(1, 8192)] = 128  # width of each policy layer and of each value layer
     initial_log_std: Annotated[float, Limits(-10, 3)] = 0.0  # log of the exploration standard deviation at the start
     learn_std: bool = True  # train the standard deviation; otherwise it stays at its start
     normalize_observations: bool = True  # running mean and variance, part of the checkpoint
@@ -43,8 +45,8 @@ class NetworkConfig:
 
     @property
     def carry_shape(self) -> tuple[int, int, int]:
-        """(L, 2, W) of one LSTM carry: layers, (h, c), and the width of all streams side by side."""
-        return 2, 2, self.hidden_size * (2 if self.symmetric else 1)
+        """(L, 2, W) of one LSTM carry: layers (0 without memory), (h, c), and the width of all streams side by side."""
+        return 2 if self.memory == "lstm" else 0, 2, self.hidden_size * (2 if self.symmetric else 1)
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,7 @@ def describe(config: Config, training_sha256: str) -> dict[str, Any]:
         ],
         "constants": task.player_constants,
         "network": {
+            "memory": config.network.memory,
             "layers": LSTM_LAYERS,
             "hidden_size": config.network.hidden_size,
             "symmetric": config.network.symmetric,

@@ -9,7 +9,7 @@ import numpy as np
 
 from hasrl_jax.deploy.files import Step, require_package, write_whole
 from hasrl_jax.learn.networks import OBSERVATION_CLIP
-from hasrl_jax.policy.numpy_networks import LAYERS, Parameters
+from hasrl_jax.policy.numpy_networks import LAYERS, Parameters, has_memory, input_size
 from hasrl_jax.types import Mirror
 
 OPSET, IR_VERSION = 17, 8  # old enough for every runtime in use
@@ -69,8 +69,46 @@ def graph(parameters: Parameters, mirror: Mirror | None) -> Any:
         constants[name] = value.astype(np.float32 if value.dtype.kind == "f" else np.int64)
         return name
 
-    size, hidden = parameters["policy/lstm_0_input"].shape[0], parameters["policy/lstm_0_recurrent"].shape[0]
     actions, streams = parameters["policy/mean_bias"].shape[0], 1 if mirror is None else 2
+    size = input_size(parameters)
+    x = _inputs(add, constant, parameters, mirror)
+    if has_memory(parameters):
+        x, width = _remember(add, constant, parameters, streams, x)
+    else:
+        x, width = _dense(add, constant, parameters, x)
+
+    head = add("MatMul", [x, constant("mean_kernel", parameters["policy/mean_kernel"])], "head_product")
+    head = add("Add", [head, constant("mean_bias", parameters["policy/mean_bias"])], "head")
+    head = add("Reshape", [head, constant("head_by_stream", [streams, -1, actions])], "head_streams")
+    if mirror is None:
+        logits = add("Squeeze", [head, constant("first_axis", [0])], "logits")
+    else:
+        add("Split", [head, constant("one_per_stream", [1, 1])], ["head_own", "head_other"], axis=0)
+        other = add("Gather", ["head_other", constant("action_index", mirror.action_index)], "head_swapped", axis=2)
+        other = add("Mul", [other, constant("action_sign", mirror.action_sign.astype(np.float32))], "head_mirrored")
+        total = add("Add", ["head_own", other], "head_sum")
+        total = add("Mul", [total, constant("half", np.float32(0.5))], "head_mean")
+        logits = add("Squeeze", [total, constant("first_axis", [0])], "logits")
+    add("Tanh", [logits], "action")
+
+    def tensor(name: str, *shape: int) -> Any:
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["E", *shape])
+
+    carry_shape = LAYERS if has_memory(parameters) else 0, 2, streams * width
+    return onnx.helper.make_graph(
+        nodes,
+        "policy",
+        [tensor("observation", size), tensor("carry", *carry_shape)],
+        [tensor("action", actions), tensor("next_carry", *carry_shape)],
+        [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+
+
+def _remember(
+    add: Callable[..., Any], constant: Callable[[str, Any], str], parameters: Parameters, streams: int, x: str
+) -> tuple[str, int]:
+    """Adds the LSTM layers on the inputs `x` [S E, O] and what makes the next carry; features [1, S E, H] and H."""
+    size, hidden = parameters["policy/lstm_0_input"].shape[0], parameters["policy/lstm_0_recurrent"].shape[0]
     per_stream = [-1, LAYERS, 2, streams, hidden]
     split = add("Reshape", ["carry", constant("carry_by_stream", per_stream)], "carry_streams")
     split = add("Transpose", [split], "carry_time_major", perm=[1, 2, 3, 0, 4])
@@ -78,7 +116,6 @@ def graph(parameters: Parameters, mirror: Mirror | None) -> Any:
     states = [name for layer in range(LAYERS) for name in (f"hidden_{layer}", f"cell_{layer}")]
     add("Split", [split, constant("one_each", [1] * (2 * LAYERS))], states, axis=0)
 
-    x = _inputs(add, constant, parameters, mirror)
     x = add("Reshape", [x, constant("one_step", [1, -1, size])], "lstm_0_x")
     following = []
     for layer in range(LAYERS):
@@ -98,36 +135,24 @@ def graph(parameters: Parameters, mirror: Mirror | None) -> Any:
         following += after
         x = add("Tanh", [after[0]], f"features_{layer}")
 
-    head = add("MatMul", [x, constant("mean_kernel", parameters["policy/mean_kernel"])], "head_product")
-    head = add("Add", [head, constant("mean_bias", parameters["policy/mean_bias"])], "head")
-    head = add("Reshape", [head, constant("head_by_stream", [streams, -1, actions])], "head_streams")
-    if mirror is None:
-        logits = add("Squeeze", [head, constant("first_axis", [0])], "logits")
-    else:
-        add("Split", [head, constant("one_per_stream", [1, 1])], ["head_own", "head_other"], axis=0)
-        other = add("Gather", ["head_other", constant("action_index", mirror.action_index)], "head_swapped", axis=2)
-        other = add("Mul", [other, constant("action_sign", mirror.action_sign.astype(np.float32))], "head_mirrored")
-        total = add("Add", ["head_own", other], "head_sum")
-        total = add("Mul", [total, constant("half", np.float32(0.5))], "head_mean")
-        logits = add("Squeeze", [total, constant("first_axis", [0])], "logits")
-    add("Tanh", [logits], "action")
-
     packed = add("Concat", following, "next_stacked", axis=0)
     packed = add("Reshape", [packed, constant("by_stream", [LAYERS, 2, streams, -1, hidden])], "next_time_major")
     packed = add("Transpose", [packed], "next_streams", perm=[3, 0, 1, 2, 4])
     add("Reshape", [packed, constant("carry_shape", [-1, LAYERS, 2, streams * hidden])], "next_carry")
+    return x, hidden
 
-    def tensor(name: str, *shape: int) -> Any:
-        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["E", *shape])
 
-    carry_shape = LAYERS, 2, streams * hidden
-    return onnx.helper.make_graph(
-        nodes,
-        "policy",
-        [tensor("observation", size), tensor("carry", *carry_shape)],
-        [tensor("action", actions), tensor("next_carry", *carry_shape)],
-        [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
+def _dense(
+    add: Callable[..., Any], constant: Callable[[str, Any], str], parameters: Parameters, x: str
+) -> tuple[str, int]:
+    """Adds the layers of a policy without memory on the inputs `x` [S E, O]; features [S E, H] and H."""
+    add("Identity", ["carry"], "next_carry")
+    for layer in range(LAYERS):
+        kernel, bias = (parameters[f"policy/dense_{layer}_{name}"] for name in ("kernel", "bias"))
+        x = add("MatMul", [x, constant(f"dense_{layer}_kernel", kernel)], f"dense_{layer}_product")
+        x = add("Add", [x, constant(f"dense_{layer}_bias", bias)], f"dense_{layer}_sum")
+        x = add("Tanh", [x], f"features_{layer}")
+    return x, kernel.shape[1]
 
 
 def _inputs(

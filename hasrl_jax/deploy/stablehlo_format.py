@@ -17,6 +17,7 @@ from jax import export
 from hasrl_jax.config.schema import NetworkConfig
 from hasrl_jax.deploy.files import Step, write_whole
 from hasrl_jax.learn.networks import make_networks
+from hasrl_jax.policy import numpy_networks
 from hasrl_jax.policy.numpy_networks import Parameters
 from hasrl_jax.types import Mirror
 
@@ -39,7 +40,7 @@ def write(
     Raises:
       CheckpointError: the file cannot be written.
     """
-    observation_size, action_size = parameters["policy/lstm_0_input"].shape[0], parameters["policy/mean_bias"].shape[0]
+    observation_size, action_size = numpy_networks.input_size(parameters), parameters["policy/mean_bias"].shape[0]
     policy, _ = make_networks(network, observation_size, action_size, mirror)
     weights = {
         name.removeprefix("policy/"): jnp.asarray(array)

@@ -192,7 +192,10 @@ def make_engine(
       ConfigError: a setting that MJX cannot run; names what works.
     """
     if task.ground is not None:
-        raise ConfigError("cassie.terrain.kind: the mjx backend has level ground only; set it to flat, or use cpu_pool")
+        raise ConfigError(
+            "cassie.terrain.kind: the mjx backend has level ground only; set it to flat, or use cpu_pool "
+            "(MJX would compute the contacts with each box of the ground in every physics step)"
+        )
     if task.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ConfigError("physics.solver: MJX has no PGS; set it to Newton")
     if impl not in ("jax", "warp"):

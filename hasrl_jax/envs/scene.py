@@ -38,8 +38,9 @@ def place_ground(task: Task, model: mujoco.MjModel, model_fields: dict[str, np.n
     """
     if task.ground and "geom_pos" in model_fields:
         ground = model.geom_bodyid == 0  # the first geoms of any model
-        for name in ("geom_pos", "geom_size"):
-            getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]
+        for name in ("geom_pos", "geom_size", "geom_quat"):
+            if name in model_fields:
+                getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]
 
 
 class Scene:

@@ -1,11 +1,12 @@
 """Plays whole episodes: many side by side to measure a policy, or one after the other to watch it."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cpu_engine import CpuEnvs
+from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.envs.task import Task
 from hasrl_jax.policy import actor, numpy_networks
@@ -19,6 +20,7 @@ class Episodes(NamedTuple):
     reached_cap: np.ndarray  # [N] bool: ended by the time limit, not by a fall
     seconds: np.ndarray  # [N] simulated time upright
     diverged: np.ndarray  # [N] bool: ended by a failure of the simulation, whose step does not count
+    reached_goal: np.ndarray  # [N] bool: ended where it was to arrive
     measures: np.ndarray  # [T, N, M] the task's measures; NaN after an episode's end
 
 
@@ -31,6 +33,7 @@ def run_episodes(
     mean_action: bool = True,
     seconds: float | None = None,
     told: np.ndarray | None = None,
+    goal: Callable[[EnvState], np.ndarray] | None = None,
 ) -> Episodes:
     """Plays `episodes` episodes side by side in C MuJoCo, with the LSTM state carried through each.
 
@@ -43,6 +46,7 @@ def run_episodes(
       mean_action: act without exploration noise.
       seconds: the time limit instead, in simulated seconds: a randomised robot has environment steps of its own length.
       told: [N, C] a command of each episode, held to its end; None leaves them to the task.
+      goal: whether the environments are where an episode is over as well, [N] bool.
     """
     policy = actor.reset(config, task, parameters, episodes)
     no_limit = np.iinfo(np.int64).max
@@ -61,6 +65,7 @@ def run_episodes(
         limit = np.maximum(1, np.ceil(seconds / env_step_s - 1e-9)).astype(np.int64)
     total, length = np.zeros(episodes), np.zeros(episodes, np.int64)
     reached_cap, diverged, running = np.zeros(episodes, bool), np.zeros(episodes, bool), np.ones(episodes, bool)
+    reached_goal = np.zeros(episodes, bool)
     measures = []
     for step in range(1, int(limit.max()) + 1):
         action, policy = actor.act(policy, state.observation, state.is_first)
@@ -71,13 +76,16 @@ def run_episodes(
         measures.append(np.where(valid[:, None], result.measures, np.nan))
         total += np.where(valid, result.reward, 0.0)
         length += valid
-        over = (step >= limit) & ~result.terminated & ~result.diverged
-        reached_cap |= running & over
+        standing = running & ~result.terminated & ~result.diverged  # the others are already somewhere else
+        if goal is not None:
+            reached_goal |= standing & goal(state)
+        over = (step >= limit) & standing & ~reached_goal
+        reached_cap |= over
         diverged |= running & result.diverged
-        running &= ~(result.terminated | over | result.diverged)
+        running = standing & ~over & ~reached_goal
         if not running.any():
             break
-    return Episodes(total, length, reached_cap, length * env_step_s, diverged, np.stack(measures))
+    return Episodes(total, length, reached_cap, length * env_step_s, diverged, reached_goal, np.stack(measures))
 
 
 class Outcome(NamedTuple):

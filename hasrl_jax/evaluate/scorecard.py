@@ -10,7 +10,7 @@ import logging
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -302,7 +302,7 @@ def _read(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
 
 
-def refuse_settings(arguments: list[str]) -> None:
+def refuse_settings(arguments: list[str], what: str = "a scorecard") -> None:
     """Refuses overrides of what the rows set themselves.
 
     Raises:
@@ -311,7 +311,7 @@ def refuse_settings(arguments: list[str]) -> None:
     for argument in arguments:
         option = argument.partition("=")[0].replace("_", "-")
         if option.startswith(tuple(f"--cassie.{setting}" for setting in SETTINGS)):
-            raise ConfigError(f"{option}: a scorecard sets it for each of its rows; leave it out")
+            raise ConfigError(f"{option}: {what} sets it for each of its rows; leave it out")
 
 
 def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
@@ -351,15 +351,20 @@ def measure(
         if number >= skip
         for done in range(0, episodes, BATCH)
     ]
+    parts: list[dict[str, np.ndarray]] = []
+    for job, part in zip(jobs, in_processes(_play, jobs), strict=True):
+        parts.append(part)
+        if sum(len(p["seconds"]) for p in parts) == episodes:
+            yield summarize_row(job[0], job[1], parts)
+            parts = []
+
+
+def in_processes(play: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
+    """What `play` makes of each job, in their order, by a process per core."""
     os.environ.update(ONE_THREAD)  # the processes inherit it before they load NumPy
     # Fresh interpreters: forking a process that has started JAX can hang.
     with ProcessPoolExecutor(available_cores(), multiprocessing.get_context("spawn")) as pool:
-        parts: list[dict[str, np.ndarray]] = []
-        for job, part in zip(jobs, pool.map(_play, jobs), strict=True):
-            parts.append(part)
-            if sum(len(p["seconds"]) for p in parts) == episodes:
-                yield summarize_row(job[0], job[1], parts)
-                parts = []
+        yield from pool.map(play, jobs)
 
 
 def _play(job: tuple[Row, Config, Parameters, int, list[int], Robot | None]) -> dict[str, np.ndarray]:

@@ -44,13 +44,14 @@ def normalize_observation(observation: jax.Array, mean: jax.Array | None, std: j
     return jnp.clip((observation - mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
-def zero_carry(batch: int, hidden_size: int, symmetric: bool = False) -> np.ndarray:
+def zero_carry(batch: int, hidden_size: int, symmetric: bool = False, memory: str = "lstm") -> np.ndarray:
     """The LSTM carry at the start of an episode: zeros [batch, L, 2 (h, c), W].
 
-    W is hidden_size, or twice that for a symmetric policy (first half: the stream of the observation itself, second
-    half: the stream of its mirror image).
+    L is 0 without memory. W is hidden_size, or twice that for a symmetric policy (first half: the stream of the
+    observation itself, second half: the stream of its mirror image).
     """
-    return np.zeros((batch, LSTM_LAYERS, 2, hidden_size * (2 if symmetric else 1)), np.float32)
+    layers = LSTM_LAYERS if memory == "lstm" else 0
+    return np.zeros((batch, layers, 2, hidden_size * (2 if symmetric else 1)), np.float32)
 
 
 def _orthogonal_gates(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
@@ -73,11 +74,15 @@ class Policy(nn.Module):
         lstm_{l}_input [O or H, 4H], lstm_{l}_recurrent [H, 4H], lstm_{l}_bias [4H],
         mean_kernel [H, A], mean_bias [A], log_std [A].
 
+    Without memory each layer is x = tanh(x W + b) with dense_{l}_kernel [O or H, H] and dense_{l}_bias [H], and the
+    carry is empty.
+
     With a mirror M the same weights run on the observation and on its mirror image,
         mean(o) = tanh((head(h(o)) + M head(h(M o))) / 2),
     so that mean(M o) = M mean(o) for any parameters and any observation statistics.
 
-    Source: paper II.E (policy representation). Differs from the paper: observation normalisation and the mirror.
+    Source: paper II.E (policy representation). Differs from the paper: observation normalisation, the mirror and the
+    choice of no memory.
     """
 
     observation_size: int
@@ -86,10 +91,16 @@ class Policy(nn.Module):
     initial_log_std: float = 0.0
     learn_std: bool = True
     mirror: Mirror | None = None
+    memory: str = "lstm"
 
     def setup(self) -> None:
-        hidden, layers = self.hidden_size, []
+        hidden = self.hidden_size
+        layers: list[tuple[jax.Array, ...]] = []
         for layer, width in ((0, self.observation_size), (1, hidden)):
+            if self.memory == "none":
+                kernel = self.param(f"dense_{layer}_kernel", nn.initializers.orthogonal(2.0**0.5), (width, hidden))
+                layers.append((kernel, self.param(f"dense_{layer}_bias", nn.initializers.zeros, (hidden,))))
+                continue
             layers.append(
                 (
                     self.param(f"lstm_{layer}_input", nn.initializers.lecun_uniform(), (width, GATES * hidden)),
@@ -137,13 +148,27 @@ class Policy(nn.Module):
             observation = observation[:, None]
             is_first = None if is_first is None else is_first[:, None]
         batch, steps = observation.shape[:2]
-        initial = zero_carry(batch, self.hidden_size, self.mirror is not None) if carry is None else carry
+        if carry is None:
+            carry = jnp.asarray(zero_carry(batch, self.hidden_size, self.mirror is not None, self.memory))
         streams = [observation] if self.mirror is None else [observation, self.mirror.observation(observation)]
         count = len(streams)
         # Streams stand side by side on the batch axis, so a batch split over devices stays where it is.
         inputs = normalize_observation(jnp.stack(streams, axis=1), observation_mean, observation_std)
         inputs = jnp.swapaxes(inputs.reshape(batch * count, steps, -1), 0, 1)  # time-major for the scan
-        state = jnp.moveaxis(jnp.reshape(initial, (batch, LSTM_LAYERS, 2, count, -1)), 3, 1)
+        if self.memory == "none":
+            for kernel, bias in self.layers:
+                inputs = jnp.tanh(inputs @ kernel + bias)
+            new_carry = carry
+        else:
+            inputs, new_carry = self._remember(inputs, carry, is_first)
+        mean = jnp.swapaxes(self._mean(inputs.reshape(steps, batch, count, -1)), 0, 1)
+        return (mean[:, 0] if single else mean), new_carry
+
+    def _remember(self, inputs: jax.Array, carry: jax.Array, is_first: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Both LSTM layers: inputs [T, B * streams, O] and the carry of `__call__` to features and the next carry."""
+        batch, steps = carry.shape[0], inputs.shape[0]
+        count = inputs.shape[1] // batch
+        state = jnp.moveaxis(jnp.reshape(carry, (batch, LSTM_LAYERS, 2, count, -1)), 3, 1)
         state = state.reshape(batch * count, LSTM_LAYERS, 2, -1)
         keep = jnp.ones((batch, steps)) if is_first is None else 1.0 - is_first.astype(jnp.float32)
         keep = jnp.repeat(keep, count, axis=0).T[..., None]
@@ -153,9 +178,7 @@ class Policy(nn.Module):
             new_state.append(jnp.stack([hidden, cell], axis=1))
             inputs = jnp.tanh(outputs)
         new_carry = jnp.stack(new_state, axis=1).reshape(batch, count, LSTM_LAYERS, 2, -1)
-        new_carry = jnp.moveaxis(new_carry, 1, 3).reshape(initial.shape)
-        mean = jnp.swapaxes(self._mean(inputs.reshape(steps, batch, count, -1)), 0, 1)
-        return (mean[:, 0] if single else mean), new_carry
+        return inputs, jnp.moveaxis(new_carry, 1, 3).reshape(carry.shape)
 
     def _mean(self, features: jax.Array) -> jax.Array:
         """Features [T, B, streams, H] to the mean action [T, B, A]."""
@@ -233,5 +256,13 @@ def make_networks(
         check_mirror(mirror, observation_size, action_size)
     else:
         mirror = None
-    policy = Policy(observation_size, action_size, config.hidden_size, config.initial_log_std, config.learn_std, mirror)
+    policy = Policy(
+        observation_size,
+        action_size,
+        config.hidden_size,
+        config.initial_log_std,
+        config.learn_std,
+        mirror,
+        config.memory,
+    )
     return policy, Value(observation_size, config.hidden_size, mirror)

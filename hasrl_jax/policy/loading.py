@@ -100,7 +100,7 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
     trained, parameters = _from_source(source)
     if tasks.find(trained.task).name != tasks.find(config.task).name:  # a task that was extended keeps its name
         raise ConfigError(f"--init-policy {source}: a policy for task {trained.task}; this run's is {config.task}")
-    for name in ("hidden_size", "symmetric", "normalize_observations"):
+    for name in ("memory", "hidden_size", "symmetric", "normalize_observations"):
         its, ours = getattr(trained.network, name), getattr(config.network, name)
         if its != ours:
             raise ConfigError(f"network.{name}: got {ours}; --init-policy {source} needs --network.{name} {its}")
@@ -136,6 +136,7 @@ def _for_observation(
 
     fills = {
         "policy/lstm_0_input": None,
+        "policy/dense_0_kernel": None,
         "value/dense_0_kernel": None,
         "normalizer/mean": "mean",
         "normalizer/std": "std",

@@ -18,6 +18,10 @@ def parameter_shapes(observation_size: int, action_size: int, network: NetworkCo
     hidden = network.hidden_size
     shapes: dict[str, tuple[int, ...]] = {}
     for layer, inputs in enumerate((observation_size, hidden)):
+        if network.memory == "none":
+            shapes[f"policy/dense_{layer}_kernel"] = (inputs, hidden)
+            shapes[f"policy/dense_{layer}_bias"] = (hidden,)
+            continue
         shapes[f"policy/lstm_{layer}_input"] = (inputs, 4 * hidden)
         shapes[f"policy/lstm_{layer}_recurrent"] = (hidden, 4 * hidden)
         shapes[f"policy/lstm_{layer}_bias"] = (4 * hidden,)
@@ -44,12 +48,12 @@ def streams(observation: np.ndarray, parameters: Parameters, mirror: Mirror | No
 def policy_step(
     parameters: Parameters, inputs: np.ndarray, carry: np.ndarray, is_first: np.ndarray, mirror: Mirror | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One step of the recurrent policy.
+    """One step of the policy.
 
     Args:
       parameters: the arrays named by `parameter_shapes`.
       inputs: [S, E, O] from `streams`.
-      carry: [E, 2 layers, 2 (h, c), S * H] before this step.
+      carry: [E, L, 2 (h, c), S * H] before this step; L is 2, or 0 for a policy without memory.
       is_first: [E] bool, where the carry starts from zero.
       mirror: the symmetry of a symmetric network, else None.
 
@@ -57,11 +61,36 @@ def policy_step(
       The action mean [E, A] in [-1, 1], and the next carry.
     """
     num_streams, num_envs, _ = inputs.shape
+    x = inputs.reshape(num_streams * num_envs, -1)
+    if has_memory(parameters):
+        x, carry = _remember(parameters, x, carry, is_first)
+    else:
+        for layer in range(LAYERS):
+            x = np.tanh(x @ parameters[f"policy/dense_{layer}_kernel"] + parameters[f"policy/dense_{layer}_bias"])
+    head = (x @ parameters["policy/mean_kernel"] + parameters["policy/mean_bias"]).reshape(num_streams, num_envs, -1)
+    mean = head[0] if mirror is None else 0.5 * (head[0] + mirror.action(head[1]))
+    return np.tanh(mean, dtype=np.float32), carry
+
+
+def has_memory(parameters: Parameters) -> bool:
+    """Whether the policy is an LSTM."""
+    return "policy/lstm_0_input" in parameters
+
+
+def input_size(parameters: Parameters) -> int:
+    """Numbers that the policy sees."""
+    return len(parameters["policy/lstm_0_input" if has_memory(parameters) else "policy/dense_0_kernel"])
+
+
+def _remember(
+    parameters: Parameters, x: np.ndarray, carry: np.ndarray, is_first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both LSTM layers: inputs [S * E, O] and the carry of `policy_step` to features [S * E, H] and the next carry."""
+    num_envs, num_streams = len(carry), len(x) // len(carry)
     carry = carry.copy()
     carry[is_first] = 0
     per_stream = carry.reshape(num_envs, LAYERS, 2, num_streams, -1).transpose(1, 2, 3, 0, 4)
     following = np.empty_like(per_stream)
-    x = inputs.reshape(num_streams * num_envs, -1)
     for layer in range(LAYERS):
         h, c = per_stream[layer].reshape(2, num_streams * num_envs, -1)
         gates = x @ parameters[f"policy/lstm_{layer}_input"]
@@ -75,9 +104,7 @@ def policy_step(
         following[layer, 0] = h.reshape(num_streams, num_envs, width)
         following[layer, 1] = c.reshape(num_streams, num_envs, width)
         x = np.tanh(h)
-    head = (x @ parameters["policy/mean_kernel"] + parameters["policy/mean_bias"]).reshape(num_streams, num_envs, -1)
-    mean = head[0] if mirror is None else 0.5 * (head[0] + mirror.action(head[1]))
-    return np.tanh(mean, dtype=np.float32), following.transpose(3, 0, 1, 2, 4).reshape(carry.shape)
+    return x, following.transpose(3, 0, 1, 2, 4).reshape(carry.shape)
 
 
 def value(parameters: Parameters, inputs: np.ndarray) -> np.ndarray:

@@ -259,11 +259,11 @@ def _check_same_network(path: Path, saved: Signature, wanted: Signature) -> None
 
 def _advice(saved: Signature, wanted: Signature) -> str:
     """Which configuration field makes the sizes agree."""
-    recurrent = "policy_params.lstm_0_recurrent"
+    width = "policy_params.mean_kernel"
     if set(saved) != set(wanted):
         return "it is of another network; check the fields network and ppo"
-    if saved[recurrent][1] != wanted[recurrent][1]:
-        return f"set network.hidden_size to {saved[recurrent][1][0]}, or use another run directory"
+    if saved[width][1][0] != wanted[width][1][0]:
+        return f"set network.hidden_size to {saved[width][1][0]}, or use another run directory"
     return "its observation or action sizes are those of another task; check the field task"
 
 

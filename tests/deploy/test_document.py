@@ -22,11 +22,14 @@ def code_of_the_document():
     return names
 
 
-@pytest.mark.parametrize(("task_name", "symmetric"), [("cassie", True), ("cassie", False), ("cartpole", True)])
+@pytest.mark.parametrize(
+    ("task_name", "symmetric", "memory"),
+    [("cassie", True, "lstm"), ("cassie", False, "lstm"), ("cartpole", True, "lstm"), ("cassie", True, "none")],
+)
 def test_its_numpy_plays_an_exported_file_as_the_policy_does(
-    make_config, make_parameters, tmp_path, task_name, symmetric
+    make_config, make_parameters, tmp_path, task_name, symmetric, memory
 ):
-    config = make_config(task_name, symmetric)
+    config = make_config(task_name, symmetric, memory)
     task, parameters = make_task(config), make_parameters(config)
     export.write(tmp_path / "policy.npz", "npz", config, parameters, "", steps=2)
     document = code_of_the_document()

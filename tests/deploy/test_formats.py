@@ -15,7 +15,7 @@ from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.policy import loading
 
 
-def lstm_by_hand(parameters, mirror, observations):
+def policy_by_hand(parameters, mirror, observations):
     """The actions [T, E, A] of a policy for [T, E, O], in float64, gate by gate, without any of the package's code."""
     p = {name: array.astype(np.float64) for name, array in parameters.items()}
 
@@ -23,13 +23,16 @@ def lstm_by_hand(parameters, mirror, observations):
         return np.exp(-np.logaddexp(0, -x))
 
     def heads(sequence):
-        hidden = p["policy/lstm_0_recurrent"].shape[0]
+        hidden = p["policy/mean_kernel"].shape[0]
         h, c = np.zeros((2, sequence.shape[1], hidden)), np.zeros((2, sequence.shape[1], hidden))
         result = []
         for x in sequence:
             if "normalizer/mean" in p:
                 x = np.clip((x - p["normalizer/mean"]) / p["normalizer/std"], -10, 10)
             for layer in range(2):
+                if "policy/dense_0_kernel" in p:
+                    x = np.tanh(x @ p[f"policy/dense_{layer}_kernel"] + p[f"policy/dense_{layer}_bias"])
+                    continue
                 names = [f"policy/lstm_{layer}_{kind}" for kind in ("input", "recurrent", "bias")]
                 gates = x @ p[names[0]] + h[layer] @ p[names[1]] + p[names[2]]
                 i, f, g, o = (gates[:, n * hidden : (n + 1) * hidden] for n in range(4))
@@ -60,13 +63,20 @@ def write_and_load(form, path, config, parameters, mirror):
 
 @pytest.mark.parametrize("form", ["npz", "onnx", "jax"])
 @pytest.mark.parametrize(
-    ("task_name", "symmetric", "normalized"),
-    [("cassie", True, True), ("cassie", False, True), ("cartpole", True, False), ("cartpole", False, False)],
+    ("task_name", "symmetric", "normalized", "memory"),
+    [
+        ("cassie", True, True, "lstm"),
+        ("cassie", False, True, "lstm"),
+        ("cartpole", True, False, "lstm"),
+        ("cartpole", False, False, "lstm"),
+        ("cassie", True, True, "none"),
+        ("cartpole", False, False, "none"),
+    ],
 )
 def test_a_file_acts_as_the_equations_say(
-    make_config, make_parameters, tmp_path, form, task_name, symmetric, normalized
+    make_config, make_parameters, tmp_path, form, task_name, symmetric, normalized, memory
 ):
-    config = make_config(task_name, symmetric)
+    config = make_config(task_name, symmetric, memory)
     task, parameters = make_task(config), make_parameters(config)
     if not normalized:
         config = from_dict({"network": {"normalize_observations": False}}, config)
@@ -77,7 +87,7 @@ def test_a_file_acts_as_the_equations_say(
     for robots in (1, 3):
         observations = 2 * rng.standard_normal((20, robots, task.observation_size)).astype(np.float32)
         observations[3] *= 1e4  # beyond the clip of normalised observations
-        expected = lstm_by_hand(parameters, mirror, observations.astype(np.float64))
+        expected = policy_by_hand(parameters, mirror, observations.astype(np.float64))
         carry = np.zeros((robots, *config.network.carry_shape), np.float32)
         for observation, wanted in zip(observations, expected, strict=True):
             action, carry = step(observation, carry)

@@ -132,3 +132,11 @@ def test_a_model_of_several_files_is_refused(tmp_path):
     task = dataclasses.replace(make_task(shipped("cartpole")), asset=asset)
     with pytest.raises(ConfigError, match=r"meshes\.xml refers to m\.obj; expected a model in a single file"):
         model_file.write(tmp_path / "out.xml", task, shipped("cartpole").physics)
+
+
+def test_a_blind_policy_says_how_it_estimates_and_others_do_not(of_released):
+    blind = metadata.describe(from_dict({"cassie": {"observe": "blind"}}), "")
+    assert blind["constants"]["blind"] == {"unloaded_rad": 0.03, "bend_rad": 0.03, "trust": 0.5}
+    assert "blind" not in of_released["released"]["constants"]
+    notes = {row["name"]: row["note"] for row in blind["observation"]}
+    assert "blind" in notes["pelvis_height"] and "blind" in notes["pelvis_velocity"]

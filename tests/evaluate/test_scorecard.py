@@ -194,7 +194,7 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
     ("arguments", "message"),
     [
         (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
-        (["--against", "zero"], "--against: only a --scorecard compares policies"),
+        (["--against", "zero"], "--against: only a --scorecard or --stairs compares policies"),
         (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
         (["--scorecard", "DIR", "--seconds", "2"], "--seconds: got 2; expected at least 4"),
         (["--scorecard", "DIR", "--cassie.push.force-n", "0", "9"], "--cassie.push.force-n: a scorecard sets it"),

@@ -89,6 +89,7 @@ def test_a_summary_by_hand() -> None:
         reached_cap=np.array([True, False]),
         seconds=np.array([steps, 3]) * TASK.env_step_s,
         diverged=np.array([False, True]),
+        reached_goal=np.array([False, False]),
         measures=measures,
     )
     found = statistics.summarize(episodes, TASK)

@@ -74,6 +74,31 @@ def test_the_named_parameters_rebuild_the_policy_in_numpy() -> None:
     np.testing.assert_allclose(expected, np.tanh(x @ p["mean_kernel"] + p["mean_bias"]), atol=1e-6)
 
 
+def test_without_memory_every_step_stands_for_itself() -> None:
+    network = NetworkConfig(hidden_size=H, memory="none")
+    policy, _ = make_networks(network, OBSERVATION, ACTION, None)
+    params = jax.jit(policy.init)(jax.random.PRNGKey(0), jnp.zeros((1, OBSERVATION)))
+    rng = np.random.default_rng(1)
+    p = {name: rng.normal(size=array.shape).astype(np.float32) for name, array in params["params"].items()}
+    assert {name: array.shape for name, array in p.items()} == {
+        "dense_0_kernel": (OBSERVATION, H),
+        "dense_0_bias": (H,),
+        "dense_1_kernel": (H, H),
+        "dense_1_bias": (H,),
+        "mean_kernel": (H, ACTION),
+        "mean_bias": (ACTION,),
+        "log_std": (ACTION,),
+    }
+    observation, _, is_first = _data()
+    carry = jnp.zeros((B, *network.carry_shape))
+    assert carry.size == 0
+    mean, following = policy.apply({"params": p}, observation, carry, is_first, jnp.full(OBSERVATION, 0.2), jnp.ones(1))
+    x = np.tanh((np.asarray(observation) - 0.2) @ p["dense_0_kernel"] + p["dense_0_bias"])
+    x = np.tanh(x @ p["dense_1_kernel"] + p["dense_1_bias"])
+    np.testing.assert_allclose(mean, np.tanh(x @ p["mean_kernel"] + p["mean_bias"]), atol=1e-5)
+    assert following.shape == carry.shape
+
+
 def test_the_hand_written_gradient_equals_automatic_differentiation() -> None:
     rng = np.random.default_rng(0)
     shapes = {"projected": (T, B, 4 * H), "recurrent": (H, 4 * H), "hidden": (B, H), "cell": (B, H)}

@@ -21,9 +21,9 @@ def split(parameters, network):
 
 
 @pytest.mark.parametrize("task_name", ["cassie", "cartpole"])
-@pytest.mark.parametrize("symmetric", [False, True])
-def test_steps_with_resets_equal_the_flax_networks(make_config, make_parameters, task_name, symmetric):
-    config = make_config(task_name, symmetric)
+@pytest.mark.parametrize(("symmetric", "memory"), [(False, "lstm"), (True, "lstm"), (True, "none")])
+def test_steps_with_resets_equal_the_flax_networks(make_config, make_parameters, task_name, symmetric, memory):
+    config = make_config(task_name, symmetric, memory)
     task, plan, parameters = make_task(config), make_plan(config), make_parameters(config)
     policy, value = make_networks(config.network, task.observation_size, task.action_size, task.mirror)
     mirror = task.mirror if symmetric else None
@@ -62,12 +62,14 @@ def test_log_probability_equals_the_learners(make_config, make_parameters, symme
     np.testing.assert_allclose(numpy_policy.log_prob(noise, log_std), expected, atol=1e-4)
 
 
-def test_parameter_shapes_are_those_of_the_learner(make_config):
-    learner = jax.eval_shape(lambda key: ppo.init_learner(make_config("cassie"), 50, 10, None, key), jax.random.key(0))
+@pytest.mark.parametrize("memory", ["lstm", "none"])
+def test_parameter_shapes_are_those_of_the_learner(make_config, memory):
+    config = make_config("cassie", memory=memory)
+    learner = jax.eval_shape(lambda key: ppo.init_learner(config, 50, 10, None, key), jax.random.key(0))
     shapes = {f"policy/{name}": array.shape for name, array in learner.policy_params.items()}
     shapes |= {f"value/{name}": array.shape for name, array in learner.value_params.items()}
     shapes |= {"normalizer/mean": (50,), "normalizer/std": (50,)}
-    assert numpy_policy.parameter_shapes(50, 10, make_config("cassie").network) == shapes
+    assert numpy_policy.parameter_shapes(50, 10, config.network) == shapes
 
 
 def test_a_worker_multiplies_matrices_with_its_variables():

@@ -102,7 +102,7 @@ def test_a_learner_given_a_policy_acts_as_it_does() -> None:
     config = shipped("cassie_stairs")
     task = make_task(config)
     learner = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
-    released = policies.load_initial(config, "released")
+    released = policies.load_initial(config, "released-steer")
     given = policies.with_parameters(learner, released)
     assert jax.tree.structure(given) == jax.tree.structure(learner)
     for ours, theirs in zip(jax.tree.leaves(given), jax.tree.leaves(learner), strict=True):
@@ -151,6 +151,7 @@ def test_a_policy_that_wants_to_see_more_than_there_is_is_refused(tmp_path: Path
     [
         ({"network": {"hidden_size": 32}}, "network.hidden_size: got 32; .* needs --network.hidden_size 64"),
         ({"network": {"symmetric": False}}, "network.symmetric: got False; .* needs --network.symmetric True"),
+        ({"network": {"memory": "none"}}, "network.memory: got none; .* needs --network.memory lstm"),
         ({"task": "cartpole"}, "--init-policy released: a policy for task cassie; this run's is cartpole"),
     ],
 )

@@ -322,6 +322,19 @@ def test_a_config_file_is_read_strictly(text, named, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_a_policy_without_memory_trains_goes_on_and_is_played(tiny, tmp_path):
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    options = ["--config", str(tiny), "--num-workers", "1", "--network.memory", "none"]
+    assert train_main([*options, "--run-dir", str(run), "--total-env-steps", "256"]) == 0
+    assert train_main(["--resume", str(run), "--total-env-steps", "512"]) == 0
+    assert train_main([*options, "--run-dir", str(whole)]) == 0
+    assert len(records(run)) == 4
+    assert untimed(run) == untimed(whole)
+    assert records(run)[0]["ratio_first"] == pytest.approx(1.0, abs=1e-5)
+    _, parameters = load_policy_parameters(run, None)
+    assert "policy/dense_1_kernel" in parameters and "policy/lstm_0_input" not in parameters
+
+
 def test_the_lstm_learns_a_task_that_needs_memory(tmp_path):
     """A cart-pole with hidden velocities is solved: every test episode lasts to the time limit."""
     run = tmp_path / "run"

@@ -120,12 +120,23 @@ class PushConfig:
 
 @dataclass(frozen=True)
 class TerrainConfig:
-    kind: Literal["flat", "steps", "rough"] = "flat"  # steps: stairs up, then down; rough: blocks of random heights
-    # rise of every step of an episode; rough: height of each block, m
+    # steps: flights of stairs, by turns up and down; rough: blocks of random heights; slopes: of random inclinations
+    kind: Literal["flat", "steps", "rough", "slopes"] = "flat"
+    # rise of every step of an episode, where it is negative the first flight leads down; rough: height of each block, m
     step_height_m: Annotated[Range, Limits(-0.5, 0.5)] = (-0.1, 0.1)
-    # length of a step or block along x, one draw per episode, m
-    step_depth_m: Annotated[Range, Limits(0.1, 2)] = (0.3, 0.5)
+    # length of a step, block or slope along x, one draw per episode, m
+    step_depth_m: Annotated[Range, Limits(0.1, 4)] = (0.3, 0.5)
+    step_noise_m: Annotated[float, Limits(0, 0.2)] = 0.0  # steps: half width of the error of each one's height, m
+    # steps: number in every flight, one draw per episode
+    steps: Annotated[tuple[int, int], Limits(1, 48)] = (8, 8)
+    # steps: by how much the last one of a flight is longer than the others, one draw per episode, m
+    landing_m: Annotated[Range, Limits(0, 4)] = (0.0, 0.0)
+    slope_deg: Annotated[Range, Limits(-45, 45)] = (-10.0, 10.0)  # slopes: inclination of each, degrees
     flat_start_m: Annotated[float, Limits(0.5, 100)] = 1.0  # x at which the level ground of the start ends, m
+    approach_m: Annotated[Range, Limits(0, 100)] = (0.0, 0.0)  # by how much further on it ends, a draw per episode, m
+    level_share: Share = 0.0  # share of episodes whose ground is level all the same
+    # reward and end count heights from the mean ground so far before and behind the pelvis, at 0 from under it, m
+    average_m: Annotated[float, Limits(0, 2)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -142,6 +153,8 @@ class TerminationConfig:
 
 @dataclass(frozen=True)
 class CassieConfig:
+    # height above the ground and velocity in the observation: state, the true ones; blind, what encoders and IMU give
+    observe: Literal["state", "blind"] = "state"
     command: CommandConfig = field(default_factory=CommandConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)

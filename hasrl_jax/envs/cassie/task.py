@@ -14,7 +14,7 @@ import numpy as np
 
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout, motors
-from hasrl_jax.envs.cassie import clock, commands, other_model, randomize, rewards, terrain
+from hasrl_jax.envs.cassie import clock, commands, kinematics, other_model, randomize, rewards, terrain
 from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.other_model import Names
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
@@ -36,7 +36,7 @@ _ALONG = "along the axes of the world; in the heading frame along and across the
 _IN_PELVIS = "in the frame of the pelvis"
 # What the policy sees, followed by the commands. Source: order of the published implementation, paper section II.A.
 OBSERVATION = (
-    Entry("pelvis_height", "m", SAME, noise=0.02, note="above the ground"),
+    Entry("pelvis_height", "m", SAME, noise=0.02, note="above the ground; of a blind robot above the soles that stand"),
     Entry(
         "pelvis_orientation",
         "",
@@ -46,7 +46,7 @@ OBSERVATION = (
         note="quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
     ),
     Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, noise=0.01, parts=_MOTOR_NAMES),
-    Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1, parts=_AXES, note=_ALONG),
+    Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1, parts=_AXES, note=f"{_ALONG}; of a blind robot an estimate"),
     Entry("pelvis_angular_velocity", "rad/s", AXIAL, noise=0.2, parts=_AXES, note=_IN_PELVIS),
     Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, noise=0.5, parts=_MOTOR_NAMES),
     Entry(
@@ -105,7 +105,8 @@ class CassieState(NamedTuple):
     push: Array  # [..., 2] force of the next push, world x and y, N
     push_s: Array  # [...] seconds until that push; it acts while this is not positive
     encoder_offset: Array  # [..., 16] of the motors and the passive joints, rad
-    terrain: Array  # [..., K] uniform numbers that the ground was drawn from; K is 0 where it is flat
+    terrain: Array  # [..., 3, 1 + blocks] the ground, as `terrain.draw` returns it; [..., 0, 0] where it is flat
+    estimate: Array  # [..., 4] height and velocity of the pelvis as a blind robot has them; [..., 0] of others
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
     env_step_s: Array  # [...] duration of an environment step in this episode, s
@@ -119,6 +120,7 @@ class Constants(NamedTuple):
 
     config: CassieConfig
     ids: CassieIds
+    legs: kinematics.Legs | None  # of a blind robot
     nominal: randomize.Nominal
     model: mujoco.MjModel  # with the ground as compiled
     start_qpos: np.ndarray  # [35]
@@ -160,9 +162,11 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
         model = motors.with_curve(model, speeds)
     nominal = randomize.nominal(model, names.joints, names.bodies)
+    ids = cassie_ids(model, names.joints, names.sensors)
     constants = Constants(
         config=config.settings,
-        ids=cassie_ids(model, names.joints, names.sensors),
+        ids=ids,
+        legs=kinematics.legs(model, ids, names.joints) if config.settings.observe == "blind" else None,
         nominal=nominal,
         model=model,
         start_qpos=model.key("stand").qpos.copy(),
@@ -223,6 +227,7 @@ def player_constants(config: CassieConfig) -> dict[str, Any]:
         "gravity_m_s2": GRAVITY_M_S2,
         "clock": {name: getattr(config.clock, name) for name in clock_fields + ["stand_below_m_s"] * in_heading},
         **({"heading": {"max_heading_error_rad": config.command.max_heading_error_rad}} if in_heading else {}),
+        **({"blind": kinematics.player_constants()} if config.observe == "blind" else {}),
         "fall": dataclasses.asdict(config.termination),
     }
 
@@ -267,15 +272,20 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         push=push,
         push_s=push_s,
         encoder_offset=offset[..., None] * (2 * encoder_u - 1),
-        terrain=terrain_u,
+        terrain=terrain.draw(terrain_u, config.terrain, xp),
+        estimate=xp.zeros((*batch, 0)),
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
         **hidden,
     )
+    if constants.legs is not None:  # a robot that was blind before the episode, too, knows its velocity
+        angle = encoders(constants, state, qpos, xp)
+        above = kinematics.height(constants.legs, angle, qpos[..., 3:7], xp)
+        state = state._replace(estimate=xp.concatenate([above[..., None], qvel[..., :3]], axis=-1))
     # Nothing accelerates yet, so the first observation needs no physics.
     observation = observe(constants, state, qpos, qvel, xp.zeros((*batch, 3)), noise_u, xp)
-    fields |= terrain.model_fields(terrain_u, constants.model, config.terrain, xp)
+    fields |= terrain.model_fields(state.terrain, constants.model, config.terrain, xp)
     return Reset(state, observation, qpos, qvel, fields)
 
 
@@ -343,6 +353,7 @@ def step(
 
     height = height_above_ground(constants, state, reading.qpos, xp)
     limits = config.termination
+    state = sense(constants, state, reading, acceleration, xp)
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
@@ -369,7 +380,7 @@ def step(
     phase = xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0)
     state = state._replace(
         phase=xp.where(state.standing, state.phase, phase),
-        standing=is_standing(config, command, velocity, xp),
+        standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
         lag=lag,
         command=command,
         command_s=command_s,
@@ -387,10 +398,14 @@ def observe(
 ) -> Array:
     """The inputs of the policy, [..., O], as `observation_entries` lists them; `noise_u`: [..., noise_size]."""
     ids, offset = constants.ids, state.encoder_offset
-    velocity = pelvis_velocity(constants, state, qvel, xp)
+    velocity = seen_velocity(constants, state, qvel, xp)
     biased = velocity[..., :2] + state.velocity_bias
+    if constants.legs is None:
+        height = (qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, xp))[..., None]
+    else:
+        height = state.estimate[..., :1]
     values = {
-        "pelvis_height": height_above_ground(constants, state, qpos, xp)[..., None],
+        "pelvis_height": height,
         "pelvis_orientation": pelvis_orientation(constants, state, qpos, xp),
         "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
         "pelvis_velocity": xp.concatenate([biased, velocity[..., 2:]], axis=-1),
@@ -478,9 +493,47 @@ def pelvis_velocity(constants: Constants, state: CassieState, qvel: Array, xp: A
 
     Not along the pelvis's own heading: it sways with every step, which at 4 m/s is 0.3 m/s of apparent lateral speed.
     """
+    return in_command_frame(constants, state, qvel[..., 0:3], xp)
+
+
+def in_command_frame(constants: Constants, state: CassieState, velocity: Array, xp: Any) -> Array:
+    """A velocity in the world, [..., 3], as the commands count it."""
     if constants.config.command.frame == "world":
-        return qvel[..., 0:3]
-    return frames.turned(qvel[..., 0:3], -state.target_heading, xp)
+        return velocity
+    return frames.turned(velocity, -state.target_heading, xp)
+
+
+def seen_velocity(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> Array:
+    """`pelvis_velocity` as the robot has it: estimated by a blind one."""
+    if constants.legs is None:
+        return pelvis_velocity(constants, state, qvel, xp)
+    return in_command_frame(constants, state, state.estimate[..., 1:], xp)
+
+
+def encoders(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
+    """The angles that the encoders read, rad, [..., 16]."""
+    ids = constants.ids
+    angles = xp.concatenate([qpos[..., ids.motor_qpos], qpos[..., ids.passive_qpos]], axis=-1)
+    return angles + state.encoder_offset
+
+
+def sense(constants: Constants, state: CassieState, reading: Reading, acceleration: Array, xp: Any) -> CassieState:
+    """`state` with what a blind robot makes of its sensors after an environment step; that of others as it is."""
+    if constants.legs is None:
+        return state
+    ids, qvel = constants.ids, reading.qvel
+    above, velocity = kinematics.estimate(
+        constants.legs,
+        encoders(constants, state, reading.qpos, xp),
+        xp.concatenate([qvel[..., ids.motor_qvel], qvel[..., ids.passive_qvel]], axis=-1),
+        qvel[..., 3:6],
+        reading.qpos[..., 3:7],
+        acceleration,
+        state.estimate[..., 1:],
+        state.env_step_s,
+        xp,
+    )
+    return state._replace(estimate=xp.concatenate([above[..., None], velocity], axis=-1))
 
 
 def reward_errors(
@@ -535,5 +588,6 @@ def reward_errors(
 
 
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
-    """Height of the pelvis above the ground below it, m, [...]; it jumps where the pelvis passes the edge of a step."""
-    return qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, constants.config.terrain, xp)
+    """Height of the pelvis above the ground, m, [...], as the reward and the termination count it."""
+    half_length_m = constants.config.terrain.average_m
+    return qpos[..., 2] - terrain.mean_height(qpos[..., 0], half_length_m, state.terrain, xp)

@@ -182,6 +182,7 @@ class Browser:
                 f"/world/ground/{number}",
                 color=(200, 200, 200) if number % 2 else (235, 235, 235),
                 dimensions=tuple(2 * half),
+                wxyz=self._model.geom_quat[geom],
                 position=center if near else center - np.array([ahead, 0.0, 0.0]),
             )
 
