@@ -93,7 +93,9 @@ def library(
     straight = curves[:, 0]  # its own mirror image, but for what the recording has of chance
     curves[:, 0] = (straight + gaits.mirrored_curves(straight)) / 2
     return gaits.Library(
-        *(np.asarray(grid[name], float) for name in gaits.AXES),
+        forward_m_s=np.asarray(grid["forward_m_s"], float),
+        lateral_m_s=np.asarray(grid["lateral_m_s"], float),
+        height_m=np.asarray(grid["height_m"], float),
         curves=curves,
         states=typical_cycles(states).reshape(*shape, *states.shape[1::2]),
         standing=motion_of(standing_states, ids),

@@ -29,7 +29,7 @@ from hasrl_jax.types import Array
 FIELD = "cassie.reference.gaits"
 PACKAGED = "library"  # the name of the one that comes with the package
 PACKAGED_FILE = Path(__file__).parent / "gaits.npz"
-PACKAGED_SHA256 = ""
+PACKAGED_SHA256 = "5c72bde073483862943c98cdb9f6f2b3d73d6c6f62338054101b8c8dfcf7dc02"
 # What a curve says of each phase, in order.
 MOTION = (
     Entry("motor_positions", "rad", MOTOR_SIGNS, legs=True),
@@ -157,14 +157,16 @@ def _require_whole(library: Library) -> None:
 def both_sides(library: Library) -> Library:
     """`library` with the mirror images of its gaits to the left, which go to the right."""
     half = library.states.shape[3] // 2
-    states = np.roll(mirrored(library.states, STATE), -half, axis=3)
-    mirror = {"lateral_m_s": -library.lateral_m_s, "curves": mirrored_curves(library.curves), "states": states}
-    joined = {}
-    for name, image in mirror.items():
-        axis = 0 if name == "lateral_m_s" else 1
+
+    def joined(own: np.ndarray, image: np.ndarray, axis: int) -> np.ndarray:
         others = np.flip(image, axis).take(range(len(library.lateral_m_s) - 1), axis)
-        joined[name] = np.concatenate([others, getattr(library, name)], axis)
-    return library._replace(**joined)
+        return np.concatenate([others, own], axis)
+
+    return library._replace(
+        lateral_m_s=joined(library.lateral_m_s, -library.lateral_m_s, 0),
+        curves=joined(library.curves, mirrored_curves(library.curves), 1),
+        states=joined(library.states, np.roll(mirrored(library.states, STATE), -half, axis=3), 1),
+    )
 
 
 def require_robot(library: Library, model: mujoco.MjModel) -> None:

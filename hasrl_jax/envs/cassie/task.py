@@ -340,7 +340,7 @@ def start_in_gait(
     assert library is not None
     resting = told_to_stand(constants.config, command, xp)
     in_gait = gaits.start(library, told, start[2], resting, xp)
-    return tuple(  # type: ignore[return-value]
+    return tuple(
         xp.where(begins.reshape(begins.shape + (1,) * (other.ndim - begins.ndim)), own, other)
         for own, other in zip(in_gait, start, strict=True)
     )

@@ -7,7 +7,7 @@ import numpy as np
 from hasrl_jax.config import tasks
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.cassie import gaits
+from hasrl_jax.envs.cassie import clock, gaits
 from hasrl_jax.envs.cassie.ids import MOTORS, cassie_ids
 from hasrl_jax.envs.gymnasium import TaskEnv
 from hasrl_jax.evaluate.rollout import Player
@@ -80,7 +80,8 @@ def walk(config: Config, parameters: Parameters, speed: float, seed: int) -> Str
         return Strides(np.zeros(0), np.zeros((0, len(ids.motor_qpos))), np.zeros((0, len(ids.motor_qpos))), np.zeros(0))
     phase, motors, walked = (np.array(column) for column in zip(*rows, strict=True))
     # A measure's phase is that of the step's beginning; the joints are those of its end.
-    phase = np.mod(phase + env.task.env_step_s / library.cycle_s, 1.0)
+    cycle_s = clock.cycle_seconds(np.array(speed), config.settings.clock, np)
+    phase = np.mod(phase + env.task.env_step_s / cycle_s, 1.0)
     told = tuple(np.full(len(phase), value) for value in (speed, 0.0, height_m))
     reference = gaits.motion(library, told, phase, np.zeros(len(phase), bool), np)["motor_positions"]
     return Strides(phase, motors, reference, walked)
