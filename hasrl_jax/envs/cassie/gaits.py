@@ -29,7 +29,7 @@ from hasrl_jax.types import Array
 FIELD = "cassie.reference.gaits"
 PACKAGED = "library"  # the name of the one that comes with the package
 PACKAGED_FILE = Path(__file__).parent / "gaits.npz"
-PACKAGED_SHA256 = "5c72bde073483862943c98cdb9f6f2b3d73d6c6f62338054101b8c8dfcf7dc02"
+PACKAGED_SHA256 = "c7426f52fea6a1c6e80e2cfbda771dbc9a039fdcdf338b494795f1d828fd2094"
 # What a curve says of each phase, in order.
 MOTION = (
     Entry("motor_positions", "rad", MOTOR_SIGNS, legs=True),
