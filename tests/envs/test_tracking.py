@@ -127,7 +127,9 @@ def test_a_robot_in_the_recorded_state_earns_nearly_all_and_one_elsewhere_less(n
     after[0] += 0.025  # the path has moved on
     sums = []
     for state in (after, library.states[forward, middle, height, (begun + 12) % count]):
-        done = task.step(fresh.state, np.zeros((1, 10)), _reading(task, state), np.full((1, 20), 0.5), np)
+        done = task.step(
+            fresh.state, np.zeros((1, 10)), _reading(task, state), np.full((1, task.step_uniforms), 0.5), np
+        )
         terms = dict(zip(task.reward_terms, done.reward_terms[0], strict=True))
         np.testing.assert_allclose(sum(terms.values()), done.reward[0])
         sums.append(terms["reference_joints"] + terms["reference_attitude"])
@@ -148,7 +150,9 @@ def test_an_episode_ends_where_the_reference_is_lost() -> None:
         fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
         lost = np.concatenate([fresh.qpos[0], np.zeros(32)])
         lost[0], lost[7:] = 30.0, lost[7:] + 1.0
-        done = task.step(fresh.state, np.zeros((1, 10)), _reading(task, lost), np.full((1, 20), 0.5), np)
+        done = task.step(
+            fresh.state, np.zeros((1, 10)), _reading(task, lost), np.full((1, task.step_uniforms), 0.5), np
+        )
         assert done.reward[0] < 0.3
         ended[least] = bool(done.terminated[0])
     assert ended == {0.0: False, 0.3: True}
@@ -190,7 +194,7 @@ def test_the_mirror_image_of_a_robot_earns_the_same(name: str) -> None:
     library = gaits.load(gaits.PACKAGED)
     robot = library.states[2, -1, 0, 7] + rng.normal(scale=0.02, size=67)
     action = rng.uniform(-0.2, 0.2, (1, 10))
-    uniforms = np.full((1, 20), 0.5)
+    uniforms = np.full((1, task.step_uniforms), 0.5)
     ours = task.step(state, action, _reading(task, robot), uniforms, np)
     theirs = task.step(image, mirror.action(action), _reading(task, gaits.mirrored(robot, gaits.STATE)), uniforms, np)
     np.testing.assert_allclose(theirs.reward_terms, ours.reward_terms, atol=1e-5)
