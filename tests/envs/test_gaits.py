@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+from functools import partial
 from math import comb
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -208,13 +210,12 @@ def test_numpy_and_jax_begin_and_move_alike() -> None:
     config = from_dict({"cassie": {"command": HEADING}}, _config(start_share=0.8, residual=True))
     task = make_task(config)
     uniforms = np.random.default_rng(2).random((16, task.reset_uniforms))
-    ours, theirs = task.reset(uniforms, np), task.reset(jnp.asarray(uniforms), jnp)
+    ours, theirs = task.reset(uniforms, np), jax.jit(partial(task.reset, xp=jnp))(uniforms)
     for name in ("qpos", "qvel", "observation"):
         np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), atol=2e-5, err_msg=name)
     actions = np.random.default_rng(3).uniform(-1, 1, (16, 10))
-    np.testing.assert_allclose(
-        task.control(theirs.state, jnp.asarray(actions), jnp), task.control(ours.state, actions, np), atol=2e-5
-    )
+    targets = jax.jit(partial(task.control, xp=jnp))(theirs.state, actions)
+    np.testing.assert_allclose(targets, task.control(ours.state, actions, np), atol=2e-5)
 
 
 def test_a_residual_action_is_added_to_the_reference_of_the_end_of_the_step() -> None:
@@ -233,8 +234,9 @@ def test_a_residual_action_is_added_to_the_reference_of_the_end_of_the_step() ->
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"reference": {"gaits": ""}}, r"reference\.gaits: got ''; expected library, or .* start_share needs one"),
+        ({"reference": {"gaits": ""}}, r"reference\.gaits: got ''; expected library, or .*start_share needs one"),
         ({"reference": {"gaits": "nowhere.npz"}}, r"gaits: got 'nowhere.npz', which does not exist; expected library"),
+        ({"reference": {"min_reward": 0.3}}, r"cassie\.reference\.min_reward: got 0\.3; expected 0 where no term of"),
         ({"clock": {"cycle_s": 0.8}}, r"cassie\.clock\.cycle_s: got 0\.8; expected 0\.75 s at all speeds"),
         ({"clock": {"cycle_per_speed_s": -0.1}}, r"cassie\.clock\.cycle_s: got 0\.75; expected 0\.75 s at all speeds"),
         (

@@ -6,7 +6,7 @@ from hasrl_jax.config.files import CONFIG_FOLDER, shipped
 from hasrl_jax.config.limits import require
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.config.tasks import TaskSpec
-from hasrl_jax.envs.cassie import gaits
+from hasrl_jax.envs.cassie import gaits, tracking
 from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.envs.cassie.task import follows_reference, make, make_on
 
@@ -55,6 +55,12 @@ def _check_reference(config: Config) -> None:
         "cassie.reference.reward": follows_reference(settings) and not reference.residual,
     }
     used = [name for name, value in uses.items() if value]
+    require(
+        reference.min_reward == 0 or tracking.wanted(reference.reward),
+        "cassie.reference.min_reward",
+        reference.min_reward,
+        "0 where no term of cassie.reference.reward has a weight",
+    )
     if not reference.gaits:
         works = f"{gaits.PACKAGED}, or a file of `hasrl gaits`, where {', '.join(used)} needs one"
         require(not used, gaits.FIELD, reference.gaits, works)

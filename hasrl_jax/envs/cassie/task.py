@@ -643,6 +643,7 @@ def seen_by_tracking(
         from_path = layout.columns([motion["pelvis_position"][..., 0], across], xp)
         yaw_rate = told["yaw_rate"]
     height = height_above_ground(constants, state, reading.qpos, xp)
+    force_clock = clock.force_clocks(state.phase, clock.swing_fraction(told["forward"], config.clock, xp), xp)
     return tracking.Seen(
         reference=motion,
         motors=reading.qpos[..., ids.motor_qpos],
@@ -656,7 +657,7 @@ def seen_by_tracking(
         acceleration=acceleration,
         torque_share=reading.sensordata[..., ids.torque] / constants.torque_limit,
         foot_force=reading.averages[..., :2],
-        force_clock=clock.force_clocks(state.phase, clock.swing_fraction(told["forward"], config.clock, xp), xp),
+        force_clock=xp.where(state.standing[..., None], 0.0, force_clock),  # no foot swings in a stand
         action_change=action - state.action,
         standing=state.standing,
     )
