@@ -29,7 +29,7 @@ from hasrl_jax.types import Array
 FIELD = "cassie.reference.gaits"
 PACKAGED = "library"  # the name of the one that comes with the package
 PACKAGED_FILE = Path(__file__).parent / "gaits.npz"
-PACKAGED_SHA256 = "c7426f52fea6a1c6e80e2cfbda771dbc9a039fdcdf338b494795f1d828fd2094"
+PACKAGED_SHA256 = "03abdca0a2df544d1065e51d8683c82da4977a6f9c8f59cf82336584a49a6a37"
 # What a curve says of each phase, in order.
 MOTION = (
     Entry("motor_positions", "rad", MOTOR_SIGNS, legs=True),
