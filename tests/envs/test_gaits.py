@@ -143,7 +143,9 @@ def test_states_keep_the_loops_of_the_legs_closed() -> None:
     model = make_task(_config()).model
     every = LIBRARY.states[::3, :, ::2, ::7].reshape(-1, LIBRARY.states.shape[-1])
     widest = [_closure_m(model, state[: model.nq]) for state in [*every, *LIBRARY.standing_states]]
-    assert max(widest) < 0.008  # under load they are springs, see test_cassie_model
+    # Under load they are springs, see test_cassie_model; a foot that lands at 2.5 m/s opens them furthest.
+    assert max(widest) < 0.012
+    assert np.median(widest) < 0.004
     stretched = every[0][: model.nq].copy()
     stretched[cassie_ids(model).passive_qpos[1]] += 0.2
     assert _closure_m(model, stretched) > 0.02
@@ -189,21 +191,18 @@ def test_a_share_of_episodes_begins_in_the_gait_of_its_command(frame: str) -> No
     assert len(set(np.round(places))) > 15
 
 
-def test_a_robot_that_begins_in_a_gait_goes_on_walking_where_one_in_the_initial_pose_falls() -> None:
+def test_a_robot_that_begins_in_a_gait_goes_on_where_one_in_the_initial_pose_does_not_move() -> None:
     """For a quarter of a second, with no policy but targets at the recorded joints."""
-    heights = []
+    speeds, command = [], {"forward_m_s": [1.0, 1.0], "lateral_m_s": [0, 0], "stand_probability": 0, "start_moving": 0}
     for share in (1.0, 0.0):
-        config = from_dict(
-            {"cassie": {"command": {"forward_m_s": [1.0, 1.0], "lateral_m_s": [0, 0], "stand_probability": 0.0}}},
-            _config(start_share=share, residual=True),
-        )
+        config = from_dict({"cassie": {"command": command}}, _config(start_share=share, residual=True))
         envs, rng = CpuEnvs(make_task(config), 8, 1000), np.random.default_rng(0)
         state = envs.reset(rng)
         for _ in range(10):
             state, result = envs.step(state, np.zeros((8, 10)), rng)
-        heights.append(result.measures[:, envs.task.measures.index("forward_speed")])
-    assert heights[0].mean() > 0.5
-    assert heights[1].mean() < 0.3
+        speeds.append(result.measures[:, envs.task.measures.index("forward_speed")])
+    assert speeds[0].min() > 0.5
+    assert speeds[1].max() < 0.3
 
 
 def test_numpy_and_jax_begin_and_move_alike() -> None:
