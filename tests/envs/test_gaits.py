@@ -145,10 +145,10 @@ def test_states_keep_the_loops_of_the_legs_closed() -> None:
     widest = [_closure_m(model, state[: model.nq]) for state in [*every, *LIBRARY.standing_states]]
     # Under load they are springs, see test_cassie_model; a foot that lands at 2.5 m/s opens them furthest.
     assert max(widest) < 0.012
-    assert np.median(widest) < 0.004
+    assert np.quantile(widest, 0.9) < 0.007
     stretched = every[0][: model.nq].copy()
-    stretched[cassie_ids(model).passive_qpos[1]] += 0.2
-    assert _closure_m(model, stretched) > 0.02
+    stretched[cassie_ids(model).passive_qpos[0]] += 0.2
+    assert _closure_m(model, stretched) > 0.05
 
 
 @pytest.mark.parametrize("frame", ["world", "heading"])
