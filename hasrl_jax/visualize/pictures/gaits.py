@@ -31,7 +31,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
 
     library, model = library_of(config), make_task(config).model
     figure = Figure(figsize=(11, 6.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[1.15, 1.0])
+    above, below = np.asarray(figure.subfigures(2, 1, height_ratios=[1.15, 1.0]))
     views = (("forward_m_s", 0, "x"), ("lateral_m_s", 1, "y"), ("height_m", 0, "x"))
     for axes, (varied, across, name) in zip(above.subplots(1, 3), views, strict=True):
         for value, color in _colored(getattr(library, varied)):

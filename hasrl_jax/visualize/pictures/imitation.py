@@ -82,6 +82,6 @@ def walk(config: Config, parameters: Parameters, speed: float, seed: int) -> Str
     # A measure's phase is that of the step's beginning; the joints are those of its end.
     cycle_s = clock.cycle_seconds(np.array(speed), config.settings.clock, np)
     phase = np.mod(phase + env.task.env_step_s / cycle_s, 1.0)
-    told = tuple(np.full(len(phase), value) for value in (speed, 0.0, height_m))
+    told = np.full(len(phase), speed), np.zeros(len(phase)), np.full(len(phase), height_m)
     reference = gaits.motion(library, told, phase, np.zeros(len(phase), bool), np)["motor_positions"]
     return Strides(phase, motors, reference, walked)
