@@ -84,6 +84,10 @@ def play(policy, model_file, seconds, command):
     told |= command
     memory = {"phase": 0.0, "heading": 0.0, "command": told, "standing": stands(data, about, told)}
     carry = np.zeros((1, *about["network"]["carry_shape"]), np.float32)
+    if about["control"] is None:
+        sys.exit(
+            "error: policy: its actions are added to a reference, which this loop does not have; see docs/deploy.md"
+        )
     scale, offset = np.array(about["control"]["scale"]), np.array(about["control"]["offset"])
     for step in range(round(seconds * about["policy_rate_hz"])):
         seen = observe(data, about, memory, moved=step > 0)

@@ -21,6 +21,7 @@ PROGRAMS = {
     "runs": ("hasrl_jax.cli.runs", "list runs and how far they have come"),
     "compare": ("hasrl_jax.cli.compare", "several runs side by side on one page: curves, settings, scorecards"),
     "pictures": ("hasrl_jax.cli.pictures", "how a policy walks: contacts, reward terms"),
+    "gaits": ("hasrl_jax.cli.gaits", "record the library of gaits that a policy walks"),
     "bench": ("hasrl_jax.cli.bench", "timed figures: collector, learner, scaling, peers, parity"),
     "completion": ("hasrl_jax.cli.completion", "what makes bash or zsh complete programs and options"),
     "doctor": ("hasrl_jax.cli.doctor", "what this machine has and lacks"),

@@ -11,12 +11,19 @@ from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config
-from hasrl_jax.visualize.pictures import commands, course, gait, rewards
+from hasrl_jax.visualize.pictures import commands, course, gait, gaits, imitation, rewards
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DRAWINGS = {"gait": gait.draw, "rewards": rewards.draw, "course": course.draw, "commands": commands.draw}
+DRAWINGS = {
+    "gait": gait.draw,
+    "rewards": rewards.draw,
+    "course": course.draw,
+    "commands": commands.draw,
+    "gaits": gaits.draw,
+    "imitation": imitation.draw,
+}
 DPI = 110
 COLORS = 64
 
@@ -56,7 +63,8 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "name",
         choices=tuple(DRAWINGS),
         help="gait: contacts and forces; rewards: every term; of a policy that is steered, course: paths from above, "
-        "commands: errors over grids of commands",
+        "commands: errors over grids of commands; gaits: the library of reference gaits; imitation: reference and "
+        "motion by phase",
     )
     add_policy_options(parser)
     parser.add_argument("--out", type=Path, help="the PNG; default: NAME.png")

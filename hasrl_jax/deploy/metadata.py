@@ -108,15 +108,15 @@ def _table(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 def _control(task: Task) -> dict[str, Any] | None:
     """How an action becomes the control of the actuators, offset + scale * clip(action); None where it is not so."""
-    state = task.reset(np.zeros(task.reset_uniforms), np).state
+    states = [task.reset(np.full(task.reset_uniforms, uniform), np).state for uniform in (0.0, 0.7)]
 
-    def control(action: np.ndarray) -> np.ndarray:
+    def control(action: np.ndarray, state: Any = states[0]) -> np.ndarray:
         return np.asarray(task.control(state, action, np))
 
     size = task.action_size
     offset = control(np.zeros(size))
-    if offset.shape != (size,):
-        return None
+    if offset.shape != (size,) or not np.array_equal(offset, control(np.zeros(size), states[1])):
+        return None  # or it changes within an episode, as with a reference
     scale = np.diag([control(unit) for unit in np.eye(size)] - offset)
     probe = np.linspace(-2.0, 2.0, size) if size > 1 else np.full(size, 2.0)
     if not np.allclose(control(probe), offset + scale * np.clip(probe, -1, 1), atol=1e-12):

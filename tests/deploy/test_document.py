@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.files import shipped
 from hasrl_jax.deploy import export, metadata
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
@@ -16,9 +17,9 @@ TEXT = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text(encoding="ut
 
 
 def code_of_the_document():
-    (block,) = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
     names = {}
-    exec(block, names)
+    for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL):
+        exec(block, names)
     return names
 
 
@@ -41,6 +42,24 @@ def test_its_numpy_plays_an_exported_file_as_the_policy_does(
         expected, policy = actor.act(policy, observation[None], np.zeros(1, bool))
         action, carry = document["act"](arrays, observation, carry)
         np.testing.assert_allclose(action, expected[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("frame", ["world", "heading"])
+def test_its_reference_is_what_residual_actions_are_added_to(frame):
+    changes = {"command": {"frame": frame, "height_m": [0.8, 0.95]}, "randomize": {"enabled": False}}
+    config = from_dict({"cassie": changes}, shipped("cassie_imitate"))
+    about, task = metadata.describe(config, ""), make_task(config)
+    assert about["control"] is None
+    constants, reference = about["constants"]["reference"], code_of_the_document()["reference"]
+    fresh = task.reset(np.random.default_rng(0).random((20, task.reset_uniforms)), np)
+    action = np.random.default_rng(1).uniform(-2, 2, (20, 10))
+    targets = task.control(fresh.state, action, np)
+    for robot, (command, phase) in enumerate(zip(fresh.state.command, fresh.state.phase, strict=True)):
+        standing = bool(fresh.state.standing[robot])
+        height = command[3] if frame == "heading" else constants["height_m_where_not_commanded"]
+        after = phase if standing else (phase + 0.025 / about["constants"]["clock"]["cycle_s"]) % 1
+        motors = reference(constants, command[0], command[1], height, after, standing)
+        np.testing.assert_allclose(targets[robot], np.clip(action[robot], -1, 1) + motors, atol=2e-5)
 
 
 def test_its_numpy_walks(tmp_path):

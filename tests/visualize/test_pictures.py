@@ -16,7 +16,7 @@ from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.runs import checkpoint
 from hasrl_jax.visualize.course import COURSES
-from hasrl_jax.visualize.pictures import commands, course, gait, rewards
+from hasrl_jax.visualize.pictures import commands, course, gait, gaits, imitation, rewards
 from hasrl_jax.visualize.pictures.record import Recording, record
 
 
@@ -148,3 +148,37 @@ def test_a_grid_of_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     assert grid.other_error.mean() < 1.5
     with pytest.raises(ConfigError, match="needs the commands forward and yaw_rate"):
         commands.measure(SMALL, _random_policy(SMALL), "yaw_rate", (0.0,), 0)
+
+
+def test_a_foot_of_the_library_swings_further_the_faster_it_walks_and_higher_than_it_stands() -> None:
+    library, model = gaits.library_of(SMALL), make_task(SMALL).model
+    middle = len(library.lateral_m_s) // 2
+    slow, fast = (gaits.foot_path(library, model, (index, middle, 1)) for index in (2, 5))
+    assert library.forward_m_s[[2, 5]].tolist() == [0.5, 2.0]
+    np.testing.assert_array_equal(fast[0], fast[-1])
+    # A stance of more than half a cycle of 0.75 s carries a foot back by this much at least.
+    assert np.ptp(fast[:, 0]) > 2 * np.ptp(slow[:, 0]) > 2 * 0.5 * 0.375
+    assert np.ptp(fast[:, 2]) > 0.05
+
+
+def test_imitation_shows_the_reference_of_the_phase_beside_the_joints(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "SETTLE_S", 0.1)
+    monkeypatch.setattr(imitation, "SHOWN_S", 0.2)
+    strides = imitation.walk(STEERED, _random_policy(STEERED), 0.5, 0)
+    assert strides.motors.shape == strides.reference.shape == (8, 10)
+    library = gaits.library_of(STEERED)
+    middle, cell = len(library.lateral_m_s) // 2, int(np.abs(library.height_m - 0.9).argmin())
+    states = library.states[2, middle, cell]
+    steps = np.mod(np.diff(strides.phase), 1.0) * STEERED.settings.clock.cycle_s
+    assert (steps > 0).all()
+    nearest = states[np.round(strides.phase * 30).astype(int) % 30][:, 7]
+    np.testing.assert_allclose(strides.reference[:, 0], nearest, atol=0.1)
+
+
+@pytest.mark.parametrize("name", ["gaits", "imitation"])
+def test_gaits_and_imitation_are_pictures(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "SETTLE_S", 0.1)
+    monkeypatch.setattr(imitation, "SHOWN_S", 0.2)
+    out = tmp_path / "picture.png"
+    assert pictures.main([name, "--out", str(out), "--physics", "training"]) == 0
+    assert Image.open(out).size[0] > 800

@@ -192,6 +192,7 @@ int main(int argc, char** argv) {
   check(ort->SessionGetModelMetadata(session, &about.metadata));
 
   const std::string constants = about["constants"], control = about["control"], network = about["network"];
+  if (control == "null") fail("policy: its actions are added to a reference, which this loop does not have");
   const std::vector<std::string> table = rows(about["observation"]);
   const double rate_hz = std::strtod(about["policy_rate_hz"].c_str(), nullptr), lowest = number(constants, "min_height_m");
   const std::vector<double> scale = numbers(control, "scale"), offset = numbers(control, "offset");

@@ -1,5 +1,6 @@
 """What an episode draws again and again: commands, and pushes on the pelvis."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,15 +47,17 @@ def named(command: Array, config: CommandConfig) -> dict[str, Array]:
     return {entry.name: command[..., index] for index, entry in enumerate(COMMANDS[config.frame])}
 
 
-def declared(config: CommandConfig, usual_height_m: float) -> tuple[Command, ...]:
-    """What the task says of its commands."""
+def declared(
+    config: CommandConfig, usual_height_m: float, bounds: Mapping[str, tuple[float, float]]
+) -> tuple[Command, ...]:
+    """What the task says of its commands; `bounds`: narrower limits than those of a range, by its field."""
     return tuple(
         Command(
             name=told.name,
             unit=told.entry.unit,
             default=usual_height_m if told is HEIGHT else 0.0,
             drawn=getattr(config, told.field),
-            limits=limits_of(CommandConfig, told.field),
+            limits=bounds.get(told.field, limits_of(CommandConfig, told.field)),
             measure=told.measure,
             step=told.step,
             keys=keys,

@@ -10,6 +10,8 @@ import numpy as np
 MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")  # per leg, left leg first
 PASSIVE_JOINTS = ("shin", "tarsus", "foot")  # per leg, left leg first
 SIDES = ("left", "right")
+# Of the motors of both legs, left leg first: a mirror changes the sign of what rolls and yaws.
+MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS) * 2
 NO_NAMES: Mapping[str, str] = MappingProxyType({})  # everything is called as in our file
 
 

@@ -140,6 +140,43 @@ class TerrainConfig:
 
 
 @dataclass(frozen=True)
+class TermConfig:
+    weight: Annotated[float, Limits(-1e6, 1e6)] = 0.0  # factor on exp(-sharpness * error)
+    sharpness: Annotated[float, Limits(0, 1e6)] = 1.0  # factor on the error, see `envs/cassie/tracking.py`
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    scale: Annotated[float, Limits(1e-6, 1e6)] = 1.0  # multiplies the sum of the terms
+    joints: TermConfig = TermConfig(sharpness=30.0)  # of the motor positions, weighted squares, rad^2
+    springs: TermConfig = TermConfig(sharpness=1000.0)  # of the leaf springs at the knees, rad^2
+    center_of_mass: TermConfig = TermConfig(sharpness=1.0)  # of the pelvis' position, m^2
+    attitude: TermConfig = TermConfig(sharpness=10.0)  # of the pelvis' orientation, squared sine of half the angle
+    path: TermConfig = TermConfig(sharpness=3.0)  # of the pelvis' horizontal position, m^2
+    height: TermConfig = TermConfig(sharpness=10.0)  # of the pelvis, m
+    forward_speed: TermConfig = TermConfig(sharpness=5.0)  # from the command, m/s
+    lateral_speed: TermConfig = TermConfig(sharpness=5.0)  # from the command, m/s
+    turning: TermConfig = TermConfig(sharpness=1.0)  # of the pelvis, from the commanded yaw rate, (rad/s)^2
+    torque: TermConfig = TermConfig(sharpness=1.0)  # mean square of the motors' shares of their limits
+    swing_force: TermConfig = TermConfig(sharpness=1.0)  # ground force under feet that should swing, in 350 N
+    acceleration: TermConfig = TermConfig(sharpness=1.0)  # of the pelvis, square, in units of gravity
+    action_change: TermConfig = TermConfig(sharpness=2.0)  # mean of the changes
+    still: TermConfig = TermConfig(sharpness=50.0)  # mean square of the motors' speeds while the clock rests, (rad/s)^2
+
+
+@dataclass(frozen=True)
+class ReferenceConfig:
+    # the gaits that are used below: none, those of the package ("library"), or a file of `hasrl gaits`
+    gaits: str = ""
+    # share of episodes that begin in a state of the gait nearest to their command, at any phase
+    start_share: Share = 0.0
+    residual: bool = False  # actions are added to the motor positions of the reference, not to the neutral pose
+    # the episode ends where the terms of `reward` sum to less; 0 never
+    min_reward: Annotated[float, Limits(0, 1e6)] = 0.0
+    reward: TrackingConfig = field(default_factory=TrackingConfig)
+
+
+@dataclass(frozen=True)
 class TerminationConfig:
     min_height_m: Share = 0.6  # the episode ends when the pelvis is lower above the ground (the paper: 0.4)
     max_height_m: Annotated[float, Limits(1.02, 1e3)] = 3.0  # or higher
@@ -162,4 +199,5 @@ class CassieConfig:
     randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
     push: PushConfig = field(default_factory=PushConfig)
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)

@@ -6,8 +6,9 @@ from hasrl_jax.config.files import CONFIG_FOLDER, shipped
 from hasrl_jax.config.limits import require
 from hasrl_jax.config.schema import Config, PhysicsConfig
 from hasrl_jax.config.tasks import TaskSpec
+from hasrl_jax.envs.cassie import gaits, tracking
 from hasrl_jax.envs.cassie.settings import CassieConfig, TerminationConfig
-from hasrl_jax.envs.cassie.task import make, make_on
+from hasrl_jax.envs.cassie.task import follows_reference, make, make_on
 
 
 def check(config: Config) -> None:
@@ -32,6 +33,7 @@ def check(config: Config) -> None:
         settings.randomize.control_delay_s,
         f"at most a policy period, {longest:g} s",
     )
+    _check_reference(config)
     if settings.randomize.enabled:
         scale, timestep_s = settings.randomize.physics_rate_scale, config.physics.timestep_s
         low, high = limits_of(PhysicsConfig, "timestep_s")
@@ -48,10 +50,66 @@ def played(config: Config) -> Config:
     return from_dict({"cassie": {"termination": {"max_lag_m": TerminationConfig().max_lag_m}}}, config)
 
 
+def _check_reference(config: Config) -> None:
+    """Raises the ConfigError of gaits that do not fit what uses them."""
+    settings: CassieConfig = config.settings
+    reference = settings.reference
+    uses = {
+        "cassie.reference.start_share": reference.start_share,
+        "cassie.reference.residual": reference.residual,
+        "cassie.reference.reward": follows_reference(settings) and not reference.residual,
+    }
+    used = [name for name, value in uses.items() if value]
+    require(
+        reference.min_reward == 0 or tracking.wanted(reference.reward),
+        "cassie.reference.min_reward",
+        reference.min_reward,
+        "0 where no term of cassie.reference.reward has a weight",
+    )
+    if not reference.gaits:
+        works = f"{gaits.PACKAGED}, or a file of `hasrl gaits`, where {', '.join(used)} needs one"
+        require(not used, gaits.FIELD, reference.gaits, works)
+        return
+    library = gaits.load(reference.gaits)
+    rate_hz = 1 / config.physics.env_step_s
+    require(
+        abs(rate_hz - library.policy_rate_hz) < 1e-6 * rate_hz,
+        gaits.FIELD,
+        reference.gaits,
+        f"gaits of the policy rate that physics gives, {rate_hz:g} Hz; these are of {library.policy_rate_hz:g} Hz",
+    )
+    fastest = max(abs(speed) for speed in settings.command.forward_m_s)
+    changes = settings.clock.cycle_per_speed_s and fastest > settings.clock.quicken_above_m_s
+    cycle = settings.clock.cycle_s, settings.clock.cycle_per_speed_s if changes else 0.0
+    require(
+        cycle == (library.cycle_s, 0.0),
+        "cassie.clock.cycle_s",
+        settings.clock.cycle_s,
+        f"{library.cycle_s:g} s at all speeds (cycle_per_speed_s 0), the cycle of the gaits {reference.gaits}",
+    )
+    require(
+        settings.randomize.control_delay_s[1] == 0 or not reference.residual,
+        "cassie.randomize.control_delay_s",
+        settings.randomize.control_delay_s,
+        "(0, 0) with cassie.reference.residual, whose targets move on with the reference",
+    )
+    if follows_reference(settings):
+        usual = settings.reward.height_m, settings.reward.height_m
+        in_heading = settings.command.frame == "heading"
+        for name, (low, high) in library.bounds.items():
+            is_usual = name == "height_m" and not in_heading
+            told = usual if is_usual else getattr(settings.command, name)
+            field = "cassie.reward.height_m" if is_usual else f"cassie.command.{name}"
+            inside = low - 1e-6 <= told[0] and told[1] <= high + 1e-6
+            shown = told[0] if is_usual else told
+            require(inside, field, shown, f"within {low:g} to {high:g}, where there are gaits in {reference.gaits}")
+
+
 def undisturbed(config: Config) -> Config:
     """`config` with the nominal robot, from rest, facing x, and no pushes but those that are asked for."""
     command = {"start_moving": 0.0, "start_heading_rad": 0.0}
     still = {"randomize": {"enabled": False}, "push": {"force_n": [0, 0]}, "command": command}
+    still["reference"] = {"start_share": 0.0, "min_reward": 0.0}
     return played(from_dict({"cassie": still}, config))
 
 

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout, motors
-from hasrl_jax.envs.cassie import clock, commands, kinematics, other_model, randomize, rewards, terrain
-from hasrl_jax.envs.cassie.ids import MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
+from hasrl_jax.envs.cassie import clock, commands, gaits, kinematics, other_model, randomize, rewards, terrain, tracking
+from hasrl_jax.envs.cassie.ids import MOTOR_SIGNS, MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.other_model import Names
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
 from hasrl_jax.envs.draws import between
@@ -26,8 +27,6 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array
 
 ASSET = Path(__file__).parent / "cassie.xml"
-# Of both legs, left leg first; a mirror changes the sign of what rolls and yaws.
-_MOTOR_SIGNS = tuple(-1.0 if name in ("hip-roll", "hip-yaw") else 1.0 for name in MOTORS) * 2
 _PASSIVE_SIGNS = SAME * (2 * len(PASSIVE_JOINTS))
 _MOTOR_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in MOTORS)
 _PASSIVE_NAMES = tuple(f"{side}-{name}" for side in SIDES for name in PASSIVE_JOINTS)
@@ -45,10 +44,10 @@ OBSERVATION = (
         parts=("w", *_AXES),
         note="quaternion in the world; in the heading frame relative to the heading to keep, with w >= 0",
     ),
-    Entry("motor_positions", "rad", _MOTOR_SIGNS, legs=True, noise=0.01, parts=_MOTOR_NAMES),
+    Entry("motor_positions", "rad", MOTOR_SIGNS, legs=True, noise=0.01, parts=_MOTOR_NAMES),
     Entry("pelvis_velocity", "m/s", VECTOR, noise=0.1, parts=_AXES, note=f"{_ALONG}; of a blind robot an estimate"),
     Entry("pelvis_angular_velocity", "rad/s", AXIAL, noise=0.2, parts=_AXES, note=_IN_PELVIS),
-    Entry("motor_velocities", "rad/s", _MOTOR_SIGNS, legs=True, noise=0.5, parts=_MOTOR_NAMES),
+    Entry("motor_velocities", "rad/s", MOTOR_SIGNS, legs=True, noise=0.5, parts=_MOTOR_NAMES),
     Entry(
         "pelvis_acceleration",
         "m/s^2",
@@ -63,7 +62,7 @@ OBSERVATION = (
     Entry("clock", "", 2 * NEGATED, parts=("sin", "cos"), note="of 2 pi times the gait phase; zeros while it rests"),
 )
 ACTION = (
-    Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
+    Entry("motor_targets", "rad", MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
 )
 ACTION_SIZE = layout.size(ACTION)
 # No-load speed of each motor over the ratio of its gear: the joint's speed at which it gives no torque, rad/s.
@@ -72,7 +71,7 @@ NO_LOAD_SPEED_RAD_S = {
     name: rpm * 2 * np.pi / 60 / ratio
     for name, rpm, ratio in zip(MOTORS, (2900, 2900, 1300, 1300, 5500), (25, 25, 16, 16, 50), strict=True)
 }
-NUM_ENCODERS = len(_MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
+NUM_ENCODERS = len(MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # PD targets at zero action: the motor positions of the initial pose, rad. Source: published implementation,
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
@@ -126,6 +125,8 @@ class Constants(NamedTuple):
     start_qpos: np.ndarray  # [35]
     steps_per_env_step: int
     env_step_s: float  # nominal
+    library: gaits.Library | None  # of gaits, where there is a reference
+    torque_limit: np.ndarray  # [10] of the nominal motors, N m
 
 
 def make(config: Config) -> Task:
@@ -148,6 +149,8 @@ def make_on(config: Config, file: Path, mapping: Mapping[str, Any]) -> Task:
     if config.settings.terrain.kind != "flat":
         raise ConfigError(f"cassie.terrain.kind: got {config.settings.terrain.kind}; expected flat with a --model")
     names = other_model.names_from(mapping, ASSET)
+    # Its joints may come in another order than those of recorded states.
+    config = from_dict({"cassie": {"reference": {"start_share": 0.0}}}, config)
     try:
         return _make(config, file, partial(other_model.adapt, names, file, ASSET), names)
     except ValueError as error:
@@ -163,6 +166,9 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         model = motors.with_curve(model, speeds)
     nominal = randomize.nominal(model, names.joints, names.bodies)
     ids = cassie_ids(model, names.joints, names.sensors)
+    library = gaits.load(config.settings.reference.gaits) if config.settings.reference.gaits else None
+    if library and asset == ASSET:  # another file may call its joints otherwise
+        gaits.require_robot(library, model)
     constants = Constants(
         config=config.settings,
         ids=ids,
@@ -172,11 +178,14 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         start_qpos=model.key("stand").qpos.copy(),
         steps_per_env_step=config.physics.steps_per_env_step,
         env_step_s=config.physics.env_step_s,
+        library=library,
+        torque_limit=model.actuator_forcerange[:, 1].copy(),
     )
     drawn = commands.num_uniforms(config.settings.command) + commands.PUSH_UNIFORMS
     in_heading = config.settings.command.frame == "heading"
     drawn_at_reset = drawn + 2 + in_heading + NUM_ENCODERS + terrain.num_uniforms(config.settings.terrain)
     drawn_at_reset += randomize.num_uniforms_beyond(config.settings.randomize)
+    drawn_at_reset += start_uniforms(config.settings)
     noisy = noise_size(config.settings)
     return Task(
         name="cassie",
@@ -188,19 +197,19 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         action=ACTION,
         reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset + noisy,
         step_uniforms=drawn + noisy,
-        reward_terms=rewards.TERMS,
+        reward_terms=reward_terms(config.settings),
         measures=MEASURES + (HEADING_MEASURES if in_heading else ()),
         mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
-        control=control,
+        control=partial(control, constants),
         delay=delay if max(config.settings.randomize.control_delay_s) > 0 else None,
         force=partial(force, constants),
         disturbed=config.settings.push.force_n[1] > 0,
-        commands=commands.declared(config.settings.command, config.settings.reward.height_m),
+        commands=commands.declared(config.settings.command, config.settings.reward.height_m, bounds(constants)),
         with_command=partial(with_command, config.settings),
         with_push=with_push,
         push_s=config.settings.push.duration_s,
-        player_constants=player_constants(config.settings),
+        player_constants=player_constants(constants),
         physics_features=partial(physics_features, constants),
         step=partial(step, constants),
     )
@@ -211,14 +220,36 @@ def observation_entries(config: CassieConfig) -> tuple[Entry, ...]:
     return (*OBSERVATION, *(command.entry for command in commands.COMMANDS[config.command.frame]))
 
 
+def reward_terms(config: CassieConfig) -> tuple[str, ...]:
+    """Names of the weighted terms: those of the paper, and those that compare with a reference where any counts."""
+    compared = tracking.TERMS if tracking.wanted(config.reference.reward) else ()
+    return (*rewards.TERMS, *(f"reference_{name}" for name in compared))
+
+
+def start_uniforms(config: CassieConfig) -> int:
+    """Uniform numbers that decide whether an episode begins in a gait."""
+    return int(config.reference.start_share > 0)
+
+
+def follows_reference(config: CassieConfig) -> bool:
+    """Whether the robot is to move as the reference does, so that only commands of its gaits make sense."""
+    return config.reference.residual or tracking.wanted(config.reference.reward)
+
+
+def bounds(constants: Constants) -> dict[str, tuple[float, float]]:
+    """What can be commanded where the gaits there are bound it, by the field of the command's range."""
+    return constants.library.bounds if constants.library and follows_reference(constants.config) else {}
+
+
 def noise_size(config: CassieConfig) -> int:
     """Uniform numbers that the noise of one observation consumes."""
     noisy = config.randomize.enabled and config.randomize.observation_noise > 0
     return layout.size(observation_entries(config)) if noisy else 0
 
 
-def player_constants(config: CassieConfig) -> dict[str, Any]:
+def player_constants(constants: Constants) -> dict[str, Any]:
     """Constants, besides observations and actions, that a program needs to play a policy; see docs/deploy.md."""
+    config = constants.config
     clock_fields = ["cycle_s", "cycle_per_speed_s", "quicken_above_m_s"]
     in_heading = config.command.frame == "heading"
     return {
@@ -229,6 +260,20 @@ def player_constants(config: CassieConfig) -> dict[str, Any]:
         **({"heading": {"max_heading_error_rad": config.command.max_heading_error_rad}} if in_heading else {}),
         **({"blind": kinematics.player_constants()} if config.observe == "blind" else {}),
         "fall": dataclasses.asdict(config.termination),
+        **({"reference": reference_constants(constants)} if config.reference.residual else {}),
+    }
+
+
+def reference_constants(constants: Constants) -> dict[str, Any]:
+    """The gaits whose motor positions a residual action is added to."""
+    library = constants.library
+    assert library is not None
+    place = gaits.PLACES["motor_positions"]
+    return {
+        **{name: getattr(library, name).round(6).tolist() for name in gaits.AXES},
+        "motor_curves": library.curves[..., place, :].round(5).tolist(),
+        "standing_motors": library.standing[..., place].round(5).tolist(),
+        "height_m_where_not_commanded": constants.config.reward.height_m,
     }
 
 
@@ -240,8 +285,9 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     drawn = commands.num_uniforms(config.command), commands.PUSH_UNIFORMS
     sizes = [randomize.num_uniforms(nominal), *drawn, 1, 1, int(in_heading), NUM_ENCODERS]
     sizes += [terrain.num_uniforms(config.terrain), randomize.num_uniforms_beyond(config.randomize)]
+    sizes.append(start_uniforms(config))
     parts = xp.split(uniforms, np.cumsum(sizes), axis=-1)
-    model_u, command_u, push_u, phase_u, start_u, heading_u, encoder_u, terrain_u, more_u, noise_u = parts
+    model_u, command_u, push_u, phase_u, start_u, heading_u, encoder_u, terrain_u, more_u, gait_u, noise_u = parts
 
     fields = randomize.model_fields(model_u, more_u, nominal, config.randomize, xp)
     is_drawn = randomize.is_drawn(model_u, config.randomize)
@@ -253,22 +299,27 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     half = config.command.start_heading_rad
     yaw = between(heading_u[..., 0], (-half, half)) if in_heading else xp.zeros(batch)
     qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
-    rates = xp.where(start_u < config.command.start_moving, command, 0.0)
-    velocity, turn = rates[..., :2], xp.zeros((*batch, 4))
+    moving = xp.where(start_u < config.command.start_moving, command, 0.0)
+    turn = xp.zeros((*batch, 4))
+    if in_heading:
+        turn = xp.concatenate([turn[..., :3], moving[..., 2:3]], axis=-1)
+    rest = xp.zeros((*batch, len(nominal.dof_damping) - 6))
+    qvel, phase = xp.concatenate([moving[..., :2], turn, rest], axis=-1), phase_u[..., 0]
+    if config.reference.start_share > 0:
+        begins = gait_u[..., 0] < config.reference.start_share
+        qpos, qvel, phase = start_in_gait(constants, begins, (qpos, qvel, phase), command, xp)
     if in_heading:
         upright = frames.turned_quaternion(qpos[..., 3:7], yaw, xp)
-        qpos = xp.concatenate([qpos[..., :3], upright, qpos[..., 7:]], axis=-1)
-        velocity, turn = frames.turned(velocity, yaw, xp), xp.concatenate([turn[..., :3], rates[..., 2:3]], axis=-1)
-    rest = xp.zeros((*batch, len(nominal.dof_damping) - 6))
-    qvel = xp.concatenate([velocity, turn, rest], axis=-1)
+        qpos = xp.concatenate([frames.turned(qpos[..., :3], yaw, xp), upright, qpos[..., 7:]], axis=-1)
+        qvel = xp.concatenate([frames.turned(qvel[..., :3], yaw, xp), qvel[..., 3:]], axis=-1)
     state = CassieState(
-        phase=phase_u[..., 0],
+        phase=phase,
         command=command,
         command_s=command_s,
         path=xp.zeros((*batch, 2)),
         lag=xp.zeros((*batch, 2)),
         target_heading=yaw,
-        standing=is_standing(config, command, velocity, xp),
+        standing=is_standing(config, command, qvel[..., :2], xp),
         push=push,
         push_s=push_s,
         encoder_offset=offset[..., None] * (2 * encoder_u - 1),
@@ -289,6 +340,47 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     return Reset(state, observation, qpos, qvel, fields)
 
 
+def start_in_gait(
+    constants: Constants, begins: Array, start: tuple[Array, Array, Array], command: Array, xp: Any
+) -> tuple[Array, Array, Array]:
+    """Where an episode `begins` so ([...] bool), a state of the gait nearest to its command; facing along x.
+
+    Args:
+      start: otherwise: qpos [..., 35], qvel [..., 32] and phase [...], any in [0, 1).
+    """
+    library, told = constants.library, gait_command(constants.config, command, xp)
+    assert library is not None
+    resting = told_to_stand(constants.config, command, xp)
+    in_gait = gaits.start(library, told, start[2], resting, xp)
+    return tuple(
+        xp.where(begins.reshape(begins.shape + (1,) * (other.ndim - begins.ndim)), own, other)
+        for own, other in zip(in_gait, start, strict=True)
+    )
+
+
+def gait_command(config: CassieConfig, command: Array, xp: Any) -> tuple[Array, Array, Array]:
+    """What tells gaits apart: forward and lateral speed, and height; [..., C] -> [...] each."""
+    told = commands.named(command, config.command)
+    usual = xp.full_like(told["forward"], config.reward.height_m)
+    return told["forward"], told["lateral"], told.get("height", usual)
+
+
+def reference_motion(constants: Constants, state: CassieState, xp: Any) -> dict[str, Array]:
+    """The motion that the environment step which follows `state` should end in, see `gaits.motion`."""
+    assert constants.library is not None
+    told = gait_command(constants.config, state.command, xp)
+    return gaits.motion(constants.library, told, following_phase(constants, state, xp), state.standing, xp)
+
+
+def following_phase(constants: Constants, state: CassieState, xp: Any) -> Array:
+    """The phase at the end of the environment step that follows `state`.
+
+    The clock counts environment steps, as the published one does, not randomised seconds.
+    """
+    cycle_s = clock.cycle_seconds(state.command[..., 0], constants.config.clock, xp)
+    return xp.where(state.standing, state.phase, xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0))
+
+
 def hidden_draws(uniforms: Array, is_drawn: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
     """What an episode draws of delays and measurements: fields of `CassieState`."""
     batch = is_drawn.shape
@@ -307,9 +399,16 @@ def delay(state: CassieState, xp: Any) -> tuple[Array, Array]:
     return state.action, state.delay_s
 
 
-def control(state: CassieState, action: Array, xp: Any) -> Array:
-    """PD targets in rad, [..., 10]. The encoder offset enters because the PD loop reads the same encoder."""
-    return xp.minimum(xp.maximum(action, -1.0), 1.0) + NEUTRAL_RAD - state.encoder_offset[..., :ACTION_SIZE]
+def control(constants: Constants, state: CassieState, action: Array, xp: Any) -> Array:
+    """PD targets in rad, [..., 10]. The encoder offset enters because the PD loop reads the same encoder.
+
+    A residual action is added to where the motors should be at the end of the environment step.
+    Source: Xie et al. 2018.
+    """
+    about: Array = NEUTRAL_RAD
+    if constants.config.reference.residual:
+        about = reference_motion(constants, state, xp)["motor_positions"]
+    return xp.minimum(xp.maximum(action, -1.0), 1.0) + about - state.encoder_offset[..., :ACTION_SIZE]
 
 
 def force(constants: Constants, state: CassieState, xp: Any) -> Array:
@@ -350,12 +449,19 @@ def step(
     state = follow(constants, state, reading.qpos, xp)
     errors = reward_errors(constants, state, action, reading, acceleration, xp)
     terms = rewards.weighted_terms(errors, config.reward, xp)
+    compared = None
+    if tracking.wanted(config.reference.reward):
+        seen = seen_by_tracking(constants, state, action, reading, acceleration, xp)
+        compared = tracking.weighted_terms(tracking.errors(seen, xp), config.reference.reward, xp)
+        terms = xp.concatenate([terms, compared], axis=-1)
 
     height = height_above_ground(constants, state, reading.qpos, xp)
     limits = config.termination
     state = sense(constants, state, reading, acceleration, xp)
     terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
     terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
+    if compared is not None and config.reference.min_reward > 0:
+        terminated = terminated | (compared.sum(axis=-1) < config.reference.min_reward)
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
     lag = next_lag(state, velocity[..., :2], limits.lag_memory_s, xp)
     terminated = terminated | ((lag**2).sum(axis=-1) > limits.max_lag_m**2)
@@ -375,11 +481,8 @@ def step(
     command, command_s = commands.next_command(
         state.command, state.command_s, elapsed_s, command_u, config.command, config.reward.height_m, xp
     )
-    cycle_s = clock.cycle_seconds(told["forward"], config.clock, xp)
-    # The clock counts environment steps, as the published one does, not randomised seconds.
-    phase = xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0)
     state = state._replace(
-        phase=xp.where(state.standing, state.phase, phase),
+        phase=following_phase(constants, state, xp),
         standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
         lag=lag,
         command=command,
@@ -467,7 +570,7 @@ def next_lag(state: CassieState, velocity: Array, memory_s: float, xp: Any) -> A
 
         lag' = lag e^(-dt / memory) + (command - v) dt
 
-    A steady error of the speed settles at about `memory` times itself; who starts or slows down within it is given time.
+    A steady error of the speed settles at about `memory` times itself, so a robot that sets off is given time.
     """
     step_s = state.env_step_s[..., None]
     return state.lag * xp.exp(-step_s / memory_s) + (state.command[..., :2] - velocity) * step_s
@@ -478,7 +581,14 @@ def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) 
     if config.command.frame == "world":
         return xp.zeros(command.shape[:-1], bool)
     slow = (velocity[..., :2] ** 2).sum(axis=-1) < config.clock.stand_below_m_s**2
-    return slow & (command[..., commands.MOTION] == 0).all(axis=-1)
+    return slow & told_to_stand(config, command, xp)
+
+
+def told_to_stand(config: CassieConfig, command: Array, xp: Any) -> Array:
+    """Whether a command asks for a stand, [..., C] -> [...]; in the world frame the robot steps on the spot instead."""
+    if config.command.frame == "world":
+        return xp.zeros(command.shape[:-1], bool)
+    return (command[..., commands.MOTION] == 0).all(axis=-1)
 
 
 def pelvis_orientation(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
@@ -585,6 +695,41 @@ def reward_errors(
         "torque_change": 0.25 * (torque_change.sum(axis=-1) / ACTION_SIZE),
         "action_change": 5 * (xp.abs(action - state.action).sum(axis=-1) / ACTION_SIZE),
     }
+
+
+def seen_by_tracking(
+    constants: Constants, state: CassieState, action: Array, reading: Reading, acceleration: Array, xp: Any
+) -> tracking.Seen:
+    """What the terms that compare with a reference look at; `state` as `follow` returns it."""
+    config, ids = constants.config, constants.ids
+    told = commands.named(state.command, config.command)
+    from_path = reading.qpos[..., :2] - state.path
+    yaw_rate = xp.zeros_like(told["forward"])
+    motion = reference_motion(constants, state, xp)
+    if config.command.frame == "heading":
+        # The path to keep is always abreast of the robot, so along the heading there is nothing to compare.
+        across = frames.turned(from_path, -state.target_heading, xp)[..., 1]
+        from_path = layout.columns([motion["pelvis_position"][..., 0], across], xp)
+        yaw_rate = told["yaw_rate"]
+    height = height_above_ground(constants, state, reading.qpos, xp)
+    force_clock = clock.force_clocks(state.phase, clock.swing_fraction(told["forward"], config.clock, xp), xp)
+    return tracking.Seen(
+        reference=motion,
+        motors=reading.qpos[..., ids.motor_qpos],
+        motor_speeds=reading.qvel[..., ids.motor_qvel],
+        springs=reading.qpos[..., ids.passive_qpos[[0, 3]]],
+        position=xp.concatenate([from_path, height[..., None]], axis=-1),
+        orientation=pelvis_orientation(constants, state, reading.qpos, xp),
+        velocity=pelvis_velocity(constants, state, reading.qvel, xp),
+        command=layout.columns([told["forward"], told["lateral"], yaw_rate], xp),
+        angular_velocity=reading.qvel[..., 3:6],
+        acceleration=acceleration,
+        torque_share=reading.sensordata[..., ids.torque] / constants.torque_limit,
+        foot_force=reading.averages[..., :2],
+        force_clock=xp.where(state.standing[..., None], 0.0, force_clock),  # no foot swings in a stand
+        action_change=action - state.action,
+        standing=state.standing,
+    )
 
 
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
