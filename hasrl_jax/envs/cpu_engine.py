@@ -146,9 +146,14 @@ class CpuEnvs:
         if task.delay is None:
             return control
         earlier, delay_s = task.delay(state.task, np)
-        delay_steps = delay_s / state.model_fields.get("timestep", self._timestep)
+        delay_steps = delay_s / self._physics_step_s(state)
         late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
         return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
+
+    def _physics_step_s(self, state: EnvState) -> np.ndarray | float:
+        """Physics step within the coming environment step, s, [E] or the same for all."""
+        timestep = state.model_fields.get("timestep", self._timestep)
+        return timestep if self.task.pace is None else timestep * self.task.pace(state.task, np)
 
     def keep(self, before: EnvState, after: EnvState, envs: np.ndarray, fields: bool = True) -> EnvState:
         """`after` with the environments numbered `envs` as they were `before`.
@@ -180,7 +185,10 @@ class CpuEnvs:
         Returns:
           The physics state, what the task reads of it, and which simulations diverged, [E] bool.
         """
-        task, model = self.task, self.task.model
+        task, model, timestep = self.task, self.task.model, self._physics_step_s(state)
+        if task.pace:
+            for own, seconds in zip(self._models, timestep, strict=True):
+                own.opt.timestep = seconds
         self._controls[:, :, : model.nu] = control
         if self._force:
             self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
@@ -200,7 +208,6 @@ class CpuEnvs:
             self.physics_seconds += time.thread_time() - cpu
         end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
-        timestep = state.model_fields.get("timestep", self._timestep)
         elapsed = end[:, 0] - state.physics[:, 0]
         on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
         # A sum is finite where all its numbers are.

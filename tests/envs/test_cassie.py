@@ -327,6 +327,15 @@ def test_control_by_hand() -> None:
     np.testing.assert_allclose(task.control(state, action, np), expected, atol=1e-12)
 
 
+def test_an_action_reaches_as_far_as_it_is_set_to() -> None:
+    task, _ = _make(action_range_rad=1.4)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    action = np.array([[0.5, -0.5, 1.0, -1.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    moved = task.control(fresh.state, action, np) - task.control(fresh.state, np.zeros((1, 10)), np)
+    np.testing.assert_allclose(moved, [[0.7, -0.7, 1.4, -1.4, 1.4, 0, 0, 0, 0, 0]], atol=1e-12)
+    assert [entry.scale for entry in task.action] == [1.4]
+
+
 def test_the_policy_reads_the_encoder_that_its_targets_are_tracked_with() -> None:
     """A motor that has reached its target is seen where the policy asked it to be, whatever the encoder's offset."""
     task, constants = _make()

@@ -3,7 +3,7 @@
 r = s (w1 S_F + w2 S_V + w3 e^-(E_pel+E_foot) + w4 e^-P_m + w5 e^-E_v + w6 e^-H_p + w7 e^-T_p + w8 e^-A_p)
 
 Source: paper section II.C and Table I; the definitions behind the symbols are those of the
-published implementation.
+published implementation. Differs from the paper: a ninth term, the power of the motors, whose usual weight is zero.
 """
 
 from typing import Any
@@ -23,6 +23,7 @@ TERMS = (
     "hip_roll",
     "torque_change",
     "action_change",
+    "motor_power",
 )
 MAX_FOOT_FORCE_N = 350.0
 STAND_FOOT_FORCE_N = 120.0  # a foot under less than half of the robot's 320 N counts as planted
@@ -101,7 +102,7 @@ def pelvis_motion(
 
 
 def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> Array:
-    """The weighted, scaled terms in the order of `TERMS`, [..., 8]; their sum is the reward.
+    """The weighted, scaled terms in the order of `TERMS`, [..., 9]; their sum is the reward.
 
     `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
     non-negative error E whose exp(-E) is rewarded.

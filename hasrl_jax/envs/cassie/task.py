@@ -66,6 +66,7 @@ ACTION = (
     Entry("motor_targets", "rad", _MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
 )
 ACTION_SIZE = layout.size(ACTION)
+LIFT_M = 0.2  # an episode on a slope starts higher by what the floor rises over so far, or feet would be in it
 # No-load speed of each motor over the ratio of its gear: the joint's speed at which it gives no torque, rad/s.
 # Source: `user` and `gear` of the actuators in Oregon State University's cassie.xml (revolutions per minute).
 NO_LOAD_SPEED_RAD_S = {
@@ -108,8 +109,15 @@ class CassieState(NamedTuple):
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
     env_step_s: Array  # [...] duration of an environment step in this episode, s
+    is_drawn: Array  # [...] bool: the robot is not the nominal one
+    period_scale: Array  # [...] factor on the duration of the coming environment step
     delay_s: Array  # [...] time until new targets reach the motors, s
     velocity_bias: Array  # [..., 2] error of the observed forward and lateral velocity, m/s
+    velocity_lag_s: Array  # [...] time constant with which the observed velocity follows, s
+    late_velocity: Array  # [..., 3] what has followed so far, of the pelvis in the world, m/s
+    yaw_drift: Array  # [...] how fast the observed heading turns away, rad/s
+    yaw_error: Array  # [...] how far it has, rad
+    slope: Array  # [..., 2] rise of the floor along x and y, m per m
     noise: Array  # [...] factor on the noise of the observations
 
 
@@ -158,6 +166,9 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
     if config.settings.motor.torque_speed_curve:
         speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
         model = motors.with_curve(model, speeds)
+    if max(config.settings.randomize.floor_slope_deg) > 0:
+        # Compiled, a level floor needs no orientation of its own, and C MuJoCo would not look at one.
+        model.geom_sameframe[model.geom_bodyid == 0] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     nominal = randomize.nominal(model, names.joints, names.bodies)
     constants = Constants(
         config=config.settings,
@@ -180,14 +191,15 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=observation_entries(config.settings),
-        action=ACTION,
+        action=action_entries(config.settings),
         reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset + noisy,
-        step_uniforms=drawn + noisy,
+        step_uniforms=drawn + noisy + has_uneven_periods(config.settings.randomize),
         reward_terms=rewards.TERMS,
         measures=MEASURES + (HEADING_MEASURES if in_heading else ()),
         mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
-        control=control,
+        control=partial(control, config.settings),
+        pace=pace if has_uneven_periods(config.settings.randomize) else None,
         delay=delay if max(config.settings.randomize.control_delay_s) > 0 else None,
         force=partial(force, constants),
         disturbed=config.settings.push.force_n[1] > 0,
@@ -204,6 +216,16 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
 def observation_entries(config: CassieConfig) -> tuple[Entry, ...]:
     """All that the policy sees, in order."""
     return (*OBSERVATION, *(command.entry for command in commands.COMMANDS[config.command.frame]))
+
+
+def action_entries(config: CassieConfig) -> tuple[Entry, ...]:
+    """All that the policy decides, in order."""
+    return tuple(entry._replace(scale=config.action_range_rad) for entry in ACTION)
+
+
+def has_uneven_periods(config: RandomizeConfig) -> bool:
+    """Whether environment steps differ in their duration within an episode."""
+    return config.enabled and config.policy_period_scale != (1.0, 1.0)
 
 
 def noise_size(config: CassieConfig) -> int:
@@ -240,18 +262,24 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     fields = randomize.model_fields(model_u, more_u, nominal, config.randomize, xp)
     is_drawn = randomize.is_drawn(model_u, config.randomize)
     hidden = hidden_draws(more_u, is_drawn, config.randomize, xp)
+    slope = hidden["slope"]
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
     offset = xp.where(is_drawn, config.randomize.encoder_offset_rad, 0.0)
     command, command_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.draw_push(push_u, config.push, xp)
     half = config.command.start_heading_rad
     yaw = between(heading_u[..., 0], (-half, half)) if in_heading else xp.zeros(batch)
+    turned = hidden.pop("start_turned")
     qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
     rates = xp.where(start_u < config.command.start_moving, command, 0.0)
     velocity, turn = rates[..., :2], xp.zeros((*batch, 4))
-    if in_heading:
-        upright = frames.turned_quaternion(qpos[..., 3:7], yaw, xp)
+    if max(config.randomize.floor_slope_deg) > 0:
+        lift = LIFT_M * xp.sqrt((slope**2).sum(axis=-1, keepdims=True))
+        qpos = xp.concatenate([qpos[..., :2], qpos[..., 2:3] + lift, qpos[..., 3:]], axis=-1)
+    if in_heading or config.randomize.start_turned_rad != (0.0, 0.0):
+        upright = frames.turned_quaternion(qpos[..., 3:7], yaw + turned, xp)
         qpos = xp.concatenate([qpos[..., :3], upright, qpos[..., 7:]], axis=-1)
+    if in_heading:
         velocity, turn = frames.turned(velocity, yaw, xp), xp.concatenate([turn[..., :3], rates[..., 2:3]], axis=-1)
     rest = xp.zeros((*batch, len(nominal.dof_damping) - 6))
     qvel = xp.concatenate([velocity, turn, rest], axis=-1)
@@ -269,6 +297,10 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
+        is_drawn=is_drawn,
+        period_scale=xp.ones(batch),
+        late_velocity=qvel[..., :3],
+        yaw_error=xp.zeros(batch),
         **hidden,
     )
     # Nothing accelerates yet, so the first observation needs no physics.
@@ -278,15 +310,25 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
 
 
 def hidden_draws(uniforms: Array, is_drawn: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
-    """What an episode draws of delays and measurements: fields of `CassieState`."""
+    """What an episode draws of delays, measurements and the ground: fields of `CassieState`, and `start_turned`."""
     batch = is_drawn.shape
+    scalars = ("delay_s", "velocity_lag_s", "yaw_drift", "start_turned", "noise")
+    nothing = dict.fromkeys(scalars, xp.zeros(batch)) | dict.fromkeys(("velocity_bias", "slope"), xp.zeros((*batch, 2)))
     if not uniforms.shape[-1]:
-        return {"delay_s": xp.zeros(batch), "velocity_bias": xp.zeros((*batch, 2)), "noise": xp.zeros(batch)}
+        return nothing
     draws = randomize.beyond(uniforms, config, xp)
+    drawn = {
+        "delay_s": draws["control_delay_s"][..., 0],
+        "velocity_bias": draws["velocity_bias_m_s"],
+        "velocity_lag_s": draws["velocity_lag_s"][..., 0],
+        "yaw_drift": draws["yaw_drift_rad_s"][..., 0],
+        "start_turned": draws["start_turned_rad"][..., 0],
+        "slope": draws["floor_slope"],
+        "noise": xp.full(batch, config.observation_noise),
+    }
     return {
-        "delay_s": xp.where(is_drawn, draws["control_delay_s"][..., 0], 0.0),
-        "velocity_bias": xp.where(is_drawn[..., None], draws["velocity_bias_m_s"], 0.0),
-        "noise": xp.where(is_drawn, config.observation_noise, 0.0),
+        name: xp.where(is_drawn.reshape(batch + (1,) * (values.ndim - len(batch))), values, nothing[name])
+        for name, values in drawn.items()
     }
 
 
@@ -295,9 +337,15 @@ def delay(state: CassieState, xp: Any) -> tuple[Array, Array]:
     return state.action, state.delay_s
 
 
-def control(state: CassieState, action: Array, xp: Any) -> Array:
+def control(config: CassieConfig, state: CassieState, action: Array, xp: Any) -> Array:
     """PD targets in rad, [..., 10]. The encoder offset enters because the PD loop reads the same encoder."""
-    return xp.minimum(xp.maximum(action, -1.0), 1.0) + NEUTRAL_RAD - state.encoder_offset[..., :ACTION_SIZE]
+    targets = config.action_range_rad * xp.minimum(xp.maximum(action, -1.0), 1.0) + NEUTRAL_RAD
+    return targets - state.encoder_offset[..., :ACTION_SIZE]
+
+
+def pace(state: CassieState, xp: Any) -> Array:
+    """Factor on the physics step of the coming environment step, [...]."""
+    return state.period_scale
 
 
 def force(constants: Constants, state: CassieState, xp: Any) -> Array:
@@ -353,9 +401,9 @@ def step(
         measured.append(layout.columns([yaw_rate, told["yaw_rate"], told["height"], error], xp))
     measures = xp.concatenate(measured, axis=-1)
 
-    drawn, elapsed_s = commands.num_uniforms(config.command), state.env_step_s
+    drawn, elapsed_s = commands.num_uniforms(config.command), duration_s(state)
     command_u, push_u = uniforms[..., :drawn], uniforms[..., drawn : drawn + commands.PUSH_UNIFORMS]
-    noise_u = uniforms[..., drawn + commands.PUSH_UNIFORMS :]
+    noise_u = uniforms[..., drawn + commands.PUSH_UNIFORMS :][..., : noise_size(config)]
     push, push_s = commands.next_push(state.push, state.push_s, elapsed_s, push_u, config.push, xp)
     command, command_s = commands.next_command(
         state.command, state.command_s, elapsed_s, command_u, config.command, config.reward.height_m, xp
@@ -363,6 +411,10 @@ def step(
     cycle_s = clock.cycle_seconds(told["forward"], config.clock, xp)
     # The clock counts environment steps, as the published one does, not randomised seconds.
     phase = xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0)
+    state = estimate(constants, state, reading.qvel, xp)
+    if has_uneven_periods(config.randomize):
+        scale = between(uniforms[..., -1], config.randomize.policy_period_scale)
+        state = state._replace(period_scale=xp.where(state.is_drawn, scale, 1.0))
     state = state._replace(
         phase=xp.where(state.standing, state.phase, phase),
         standing=is_standing(config, command, velocity, xp),
@@ -381,12 +433,16 @@ def observe(
     constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, noise_u: Array, xp: Any
 ) -> Array:
     """The inputs of the policy, [..., O], as `observation_entries` lists them; `noise_u`: [..., noise_size]."""
-    ids, offset = constants.ids, state.encoder_offset
-    velocity = pelvis_velocity(constants, state, qvel, xp)
+    config, ids, offset = constants.config, constants.ids, state.encoder_offset
+    seen, orientation = state.late_velocity, qpos[..., 3:7]
+    if config.randomize.enabled and config.randomize.yaw_drift_rad_s > 0:
+        seen = frames.turned(seen, state.yaw_error, xp)
+        orientation = frames.turned_quaternion(orientation, state.yaw_error, xp)
+    velocity = pelvis_velocity(constants, state, seen, xp)
     biased = velocity[..., :2] + state.velocity_bias
     values = {
         "pelvis_height": height_above_ground(constants, state, qpos, xp)[..., None],
-        "pelvis_orientation": pelvis_orientation(constants, state, qpos, xp),
+        "pelvis_orientation": pelvis_orientation(constants, state, orientation, xp),
         "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
         "pelvis_velocity": xp.concatenate([biased, velocity[..., 2:]], axis=-1),
         "pelvis_angular_velocity": qvel[..., 3:6],
@@ -399,7 +455,7 @@ def observe(
     observation = xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
     if not noise_u.shape[-1]:
         return observation
-    width = layout.noise(observation_entries(constants.config))
+    width = layout.noise(observation_entries(config))
     return observation + state.noise[..., None] * width * (2 * noise_u - 1)
 
 
@@ -430,11 +486,11 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     In the heading frame both wait for a robot that is too far off them: who is twisted or shoved away has to get its
     speeds right from there on, not to return.
     """
-    config, moved = constants.config.command, state.command[..., :2] * state.env_step_s[..., None]
+    config, moved = constants.config.command, state.command[..., :2] * duration_s(state)[..., None]
     if config.frame == "world":
         return state._replace(path=state.path + moved)
     told = commands.named(state.command, config)
-    target = state.target_heading + told["yaw_rate"] * state.env_step_s
+    target = state.target_heading + told["yaw_rate"] * duration_s(state)
     error, limit = frames.wrapped(target - frames.heading(qpos[..., 3:7], xp), xp), config.max_heading_error_rad
     target = frames.wrapped(target - error + xp.clip(error, -limit, limit), xp)
     drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
@@ -450,15 +506,33 @@ def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) 
     return slow & (command[..., :3] == 0).all(axis=-1)
 
 
-def pelvis_orientation(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
+def duration_s(state: CassieState) -> Array:
+    """Of the environment step that is about to begin or has just ended, s, [...]."""
+    return state.env_step_s * state.period_scale
+
+
+def estimate(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> CassieState:
+    """`state` with what a state estimator would say of velocity and heading after an environment step.
+
+    The velocity v is followed with the time constant T, as a low-pass filter does: the estimate moves by the share
+    1 - exp(-duration / T) of its distance from v.
+    """
+    settings, late, elapsed = constants.config.randomize, qvel[..., :3], duration_s(state)
+    if settings.enabled and max(settings.velocity_lag_s) > 0:
+        share = -xp.expm1(-elapsed / xp.maximum(state.velocity_lag_s, 1e-6))
+        late = state.late_velocity + share[..., None] * (late - state.late_velocity)
+    return state._replace(late_velocity=late, yaw_error=state.yaw_error + state.yaw_drift * elapsed)
+
+
+def pelvis_orientation(constants: Constants, state: CassieState, quat: Array, xp: Any) -> Array:
     """Quaternion (w, x, y, z) of the pelvis in the world, or relative to the heading to keep, [..., 4]."""
     if constants.config.command.frame == "world":
-        return qpos[..., 3:7]
-    return frames.turned_quaternion(qpos[..., 3:7], -state.target_heading, xp)
+        return quat
+    return frames.turned_quaternion(quat, -state.target_heading, xp)
 
 
 def pelvis_velocity(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> Array:
-    """Linear velocity along the axes of the world, or along the heading to keep, m/s, [..., 3].
+    """Linear velocity along the axes of the world, or along the heading to keep, m/s, [..., 3]; `qvel`: [..., 3 or nv].
 
     Not along the pelvis's own heading: it sways with every step, which at 4 m/s is 0.3 m/s of apparent lateral speed.
     """
@@ -488,7 +562,7 @@ def reward_errors(
         most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     height = height_above_ground(constants, state, reading.qpos, xp)
-    orientation = pelvis_orientation(constants, state, reading.qpos, xp)
+    orientation = pelvis_orientation(constants, state, reading.qpos[..., 3:7], xp)
     pelvis_error = 1.0 - orientation[..., 0] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
     velocity_error = xp.abs(velocity[..., :2] - state.command[..., :2])
@@ -515,9 +589,13 @@ def reward_errors(
         "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
         "torque_change": 0.25 * (torque_change.sum(axis=-1) / ACTION_SIZE),
         "action_change": 5 * (xp.abs(action - state.action).sum(axis=-1) / ACTION_SIZE),
+        "motor_power": reading.averages[..., -1] / settings.motor_power_w,
     }
 
 
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
     """Height of the pelvis above the ground below it, m, [...]; it jumps where the pelvis passes the edge of a step."""
-    return qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, constants.config.terrain, xp)
+    height = qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, constants.config.terrain, xp)
+    if max(constants.config.randomize.floor_slope_deg) > 0:
+        height = height - (state.slope * qpos[..., :2]).sum(axis=-1)
+    return height
