@@ -86,7 +86,7 @@ class CpuEnvs:
         """Fresh episodes in all environments."""
         fresh = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
         state = EnvState(
-            physics=np.concatenate([np.zeros((self.num_envs, 1)), fresh.qpos, fresh.qvel], axis=1),
+            physics=_physics(fresh, self.task.model.na),
             task=fresh.state,
             model_fields=fresh.model_fields,
             observation=fresh.observation,
@@ -234,8 +234,7 @@ class CpuEnvs:
             return values
 
         physics = state.physics.copy()  # what the task returned may be a view of it
-        physics[envs] = 0.0
-        physics[envs, 1:] = np.concatenate([fresh.qpos[rows], fresh.qvel[rows]], axis=1)
+        physics[envs] = _physics(fresh, self.task.model.na)[rows]
         # These arrays were made for this state alone.
         state.is_first[envs], state.episode_step[envs], state.episode_return[envs] = True, 0, 0.0
         for row, env in zip(range(rows.start, rows.stop), envs, strict=True):
@@ -255,3 +254,9 @@ class CpuEnvs:
                 model.opt.timestep = values[row]
             else:
                 getattr(model, name)[:] = values[row]
+
+
+def _physics(fresh: Reset, activations: int) -> np.ndarray:
+    """The physics state of fresh episodes, [E, nstate]: time, qpos, qvel, and what lags in actuators at rest."""
+    num_envs = len(fresh.qpos)
+    return np.concatenate([np.zeros((num_envs, 1)), fresh.qpos, fresh.qvel, np.zeros((num_envs, activations))], axis=1)

@@ -200,6 +200,11 @@ def make_engine(
     """
     if task.ground is not None:
         raise ConfigError("cassie.terrain.kind: the mjx backend has level ground only; set it to flat, or use cpu_pool")
+    if task.model.na:
+        raise ConfigError(
+            f"{task.name}: the mjx backend keeps no state of actuators from one environment step to the next; set "
+            "cassie.randomize.torque_lag_s to 0 0, or use cpu_pool"
+        )
     if task.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ConfigError("physics.solver: MJX has no PGS; set it to Newton")
     if impl not in ("jax", "warp"):

@@ -28,6 +28,7 @@ BEYOND_PAPER = {
     "payload_kg": 1,
     "center_of_mass_m": 3,
     "control_delay_s": 1,
+    "torque_lag_s": 1,
     "velocity_bias_m_s": 2,
     "velocity_lag_s": 1,
     "yaw_drift_rad_s": 1,
@@ -52,6 +53,7 @@ class Nominal(NamedTuple):
     actuator_gainprm: np.ndarray  # [nu, 10]
     actuator_biasprm: np.ndarray  # [nu, 10]
     actuator_forcerange: np.ndarray  # [nu, 2]
+    actuator_dynprm: np.ndarray  # [nu, 10]
     subtree: np.ndarray  # [nbody, nbody] 1 where the column's body hangs on the row's body
     dof_draw: np.ndarray  # [nv] which damping draw scales this degree of freedom, -1 for none
     num_damping: int
@@ -102,6 +104,7 @@ def nominal(
         actuator_gainprm=model.actuator_gainprm.copy(),
         actuator_biasprm=model.actuator_biasprm.copy(),
         actuator_forcerange=model.actuator_forcerange.copy(),
+        actuator_dynprm=model.actuator_dynprm.copy(),
         subtree=subtree,
         dof_draw=np.array([damped.index(joint) if joint in damped else -1 for joint in model.dof_jntid]),
         num_damping=len(damped),
@@ -155,6 +158,7 @@ def beyond(uniforms: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array
         "payload_kg": config.payload_kg,
         "center_of_mass_m": (-shift, shift),
         "control_delay_s": config.control_delay_s,
+        "torque_lag_s": config.torque_lag_s,
         "velocity_bias_m_s": (-bias, bias),
         "velocity_lag_s": config.velocity_lag_s,
         "yaw_drift_rad_s": (-drift, drift),
@@ -218,6 +222,10 @@ def model_fields(
         payload = xp.where(drawn, draws["payload_kg"], 0.0) / constants.body_mass[constants.pelvis]
         mass_scale = mass_scale + on_pelvis * payload
         fields = _fields_beyond(draws, drawn, on_pelvis, constants, xp)
+        if max(config.torque_lag_s) > 0:
+            lag = xp.maximum(xp.where(drawn, draws["torque_lag_s"], 0.0), motors.AT_ONCE_S)
+            is_lag = np.arange(constants.actuator_dynprm.shape[1]) == motors.LAG
+            fields["actuator_dynprm"] = xp.where(is_lag, lag[..., None], constants.actuator_dynprm)
         if max(config.floor_slope_deg) > 0:
             slope = xp.where(drawn, draws["floor_slope"], 0.0)
             floor = constants.is_floor[:, None]

@@ -106,6 +106,8 @@ class RandomizeConfig:
     center_of_mass_m: Share = 0.0  # half width of the shift of the pelvis' center of mass along each axis, m
     # time until new targets reach the motors, one draw per episode, s; a policy period at most
     control_delay_s: Annotated[Range, Limits(0, 1)] = (0.0, 0.0)
+    # time constant with which a motor's torque follows, one draw per episode, s; cassie.motor.torque_speed_curve only
+    torque_lag_s: Annotated[Range, Limits(0, 0.1)] = (0.0, 0.0)
     # factor on the duration of an environment step, hence on the physics step, drawn anew for every one
     policy_period_scale: Annotated[Range, Limits(0.05, 10)] = (1.0, 1.0)
     # half width of the error of the observed forward and lateral velocity, constant in an episode, m/s

@@ -33,6 +33,12 @@ def check(config: Config) -> None:
         f"at most a policy period, {longest:g} s",
     )
     if settings.randomize.enabled:
+        require(
+            settings.motor.torque_speed_curve or settings.randomize.torque_lag_s[1] == 0,
+            "cassie.randomize.torque_lag_s",
+            settings.randomize.torque_lag_s,
+            "0 0 unless cassie.motor.torque_speed_curve is true",
+        )
         timestep_s = config.physics.timestep_s
         low, high = limits_of(PhysicsConfig, "timestep_s")
         shortest = longest = timestep_s

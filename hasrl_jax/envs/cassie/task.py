@@ -162,7 +162,15 @@ def make_on(config: Config, file: Path, mapping: Mapping[str, Any]) -> Task:
 
 
 def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] | None, names: Names) -> Task:
-    model = load_model(asset, config.physics, ground)
+    lags = config.settings.randomize.enabled and max(config.settings.randomize.torque_lag_s) > 0
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        if ground:
+            ground(spec)
+        if lags:
+            motors.let_lag(spec)
+
+    model = load_model(asset, config.physics, edit)
     if config.settings.motor.torque_speed_curve:
         speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
         model = motors.with_curve(model, speeds)
