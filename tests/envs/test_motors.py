@@ -192,5 +192,5 @@ def test_a_lag_needs_motors_with_a_curve_and_a_cpu() -> None:
     with pytest.raises(ConfigError, match=r"torque_lag_s: got .*; expected 0 0 unless cassie.motor.torque_speed_curve"):
         check(from_dict({"cassie": lag}))
     config = from_dict({"cassie": lag | {"motor": {"torque_speed_curve": True}}})
-    with pytest.raises(ConfigError, match="set cassie.randomize.torque_lag_s to 0 0, or use cpu_pool"):
+    with pytest.raises(ConfigError, match=r"set cassie.randomize.torque_lag_s to 0 0, or use cpu_pool"):
         make_engine(make_task(config), "jax", 10)
