@@ -6,8 +6,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options, require_writable
-from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, robot_of, run, to_play
+from hasrl_jax.cli.options import (
+    OneLineParser,
+    add_force_option,
+    add_model_options,
+    add_policy_options,
+    require_writable,
+)
+from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, refuse_untrained, robot_of, run, to_play
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config, EvaluateConfig
@@ -36,6 +42,9 @@ def evaluate(arguments: list[str]) -> None:
     config, parameters = policy_to_play(known, rest, "evaluate")
     robot = robot_of(known)
     task = make_task_on(config, robot) if robot else make_task(config)
+    trained = make_task(policy_to_play(known, [], "evaluate")[0]) if rest else task
+    for command in task.commands:
+        refuse_untrained(command.name, command.drawn, trained.commands, known.force)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )
@@ -90,6 +99,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "--against", nargs="*", default=[], help='more policies for the scorecard: "zero", "random", run directories'
     )
     add_model_options(parser)
+    add_force_option(parser)
     known, rest = parser.parse_known_args(arguments)
     check_number("--episodes", known.episodes, limits_of(EvaluateConfig, "episodes"))
     check_number("--seed", known.seed, limits_of(Config, "seed"))

@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any
 
 import tyro
@@ -23,6 +23,7 @@ from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import Robot
+from hasrl_jax.envs.task import Command
 from hasrl_jax.errors import ConfigError, HasrlError
 from hasrl_jax.policy.loading import load_policy_parameters, under_reference_physics
 from hasrl_jax.policy.numpy_networks import Parameters
@@ -121,6 +122,28 @@ def policy_to_play(known: argparse.Namespace, overrides: list[str], program: str
     """
     trained, parameters = load_policy_parameters(known.run_dir, known.policy)
     return to_play(trained, known.physics, overrides, program), parameters
+
+
+def refuse_untrained(name: str, asked: Iterable[float], commands: tuple[Command, ...], force: bool) -> None:
+    """Refuses to command what a policy was not trained for, unless it is forced.
+
+    Args:
+      name: of one of the commands, as in `Command.name`; others are nobody's business here.
+      asked: values of it.
+      commands: of the task that the policy was trained in; none of what it was given besides.
+      force: whether it is.
+
+    Raises:
+      ConfigError: a value outside of what was drawn, the usual one excepted.
+    """
+    for command in commands:
+        low, high = command.drawn
+        for value in asked:
+            if command.name == name and not force and value != command.default and not low <= value <= high:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')}: got {value:g}; the policy was trained for {low:g} to {high:g} "
+                    f"{command.unit}, and --force commands it all the same"
+                )
 
 
 def robot_of(known: argparse.Namespace) -> Robot | None:

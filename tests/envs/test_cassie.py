@@ -305,6 +305,28 @@ def test_measures_for_gait_analysis_are_means_over_the_physics_steps() -> None:
     assert measures["phase"] == state.task.phase[0]
 
 
+@pytest.mark.parametrize(("pitch_deg", "on_toe"), [(-20, False), (3, False), (9, True), (30, True)])
+def test_a_foot_that_points_down_stands_on_its_toe(pitch_deg: float, on_toe: bool) -> None:
+    """MuJoCo's own frame of the foot, of a robot that is tipped over as a whole."""
+    task, constants = _make(**NOMINAL_ROBOT)
+    model, data = task.model, mujoco.MjData(task.model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    ends = [data.geom(f"{side}-foot").xmat.reshape(3, 3)[:, 2] for side in ("left", "right")]
+    flat = np.rad2deg([np.arcsin(-end[2] * np.sign(end[0])) for end in ends])  # how far each points down
+    half = np.deg2rad(pitch_deg - flat.mean()) / 2
+    assert abs(flat[0] - flat[1]) < 0.1 and abs(flat.mean()) < 2
+    data.qpos[3:7] = np.cos(half), 0, np.sin(half), 0
+    mujoco.mj_forward(model, data)
+    reading = _still_reading(task, data.qpos[None].copy())
+    reading.sensordata[:] = data.sensordata
+    reading.sensordata[0, constants.ids.foot_force] = 50.0, 90.0
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    result = task.step(fresh.state, np.zeros((1, 10)), reading, np.zeros((1, task.step_uniforms)), np)
+    first = task.measures.index("left_toe_force")
+    np.testing.assert_allclose(result.measures[0, first : first + 2], [50.0, 90.0] if on_toe else 0)
+
+
 def test_the_clock_advances_by_one_environment_step() -> None:
     task, _ = _make()
     fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)

@@ -31,6 +31,8 @@ MAX_FOOT_SPEED_M_S = 2.0
 CLOCK_GAIN = 1.2
 # World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
 NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
+_W, _X, _Y, _Z = NEUTRAL_FOOT_QUAT
+TOE_AXIS = np.array([1 - 2 * (_Y**2 + _Z**2), 2 * (_X * _Y - _W * _Z), 2 * (_X * _Z + _W * _Y)])  # ahead, in its frame
 
 
 def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -> Array:

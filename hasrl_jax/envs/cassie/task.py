@@ -78,6 +78,7 @@ NUM_ENCODERS = len(_MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
+HEEL_UP = 0.1  # sine of the angle by which a foot points down: of its 0.16 m the heel is 1.6 cm up
 MEASURES = (
     *("forward_speed", "lateral_speed"),  # of the pelvis in the command's frame, at the end of the step, m/s
     *("forward_command", "lateral_command"),  # that held during the environment step, m/s
@@ -85,6 +86,8 @@ MEASURES = (
     *("left_force", "right_force"),  # ground force on each foot, mean over the physics steps, N
     "motor_power",  # sum of |torque * joint velocity| over the motors, mean over the physics steps, W
     "phase",  # of the gait clock by which the environment step was judged, [0, 1)
+    # ground force on a foot whose heel is up, at the end of the environment step, N
+    *("left_toe_force", "right_toe_force"),
 )
 HEADING_MEASURES = (
     "yaw_rate",  # of the pelvis about the vertical at the end of the environment step, rad/s
@@ -403,6 +406,7 @@ def step(
     yaw = frames.heading(quat, xp)
     measured = [velocity[..., :2], layout.columns([told["forward"], told["lateral"], height, yaw], xp)]
     measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
+    measured.append(toe_force(constants, reading.sensordata, xp))
     if config.command.frame == "heading":
         yaw_rate = (up * reading.qvel[..., 3:6]).sum(axis=-1)
         error = frames.wrapped(yaw - state.target_heading, xp)
@@ -465,6 +469,13 @@ def observe(
         return observation
     width = layout.noise(observation_entries(config))
     return observation + state.noise[..., None] * width * (2 * noise_u - 1)
+
+
+def toe_force(constants: Constants, sensordata: Array, xp: Any) -> Array:
+    """Ground force on each foot while it points down and so stands on its toe, else 0, N, [..., 2]."""
+    ids = constants.ids
+    up = frames.up_in_body_frame(sensordata[..., ids.foot_orientation], xp)
+    return xp.where((up * rewards.TOE_AXIS).sum(axis=-1) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
 
 
 def with_command(
