@@ -13,7 +13,15 @@ from hasrl_jax.cli.options import (
     add_policy_options,
     require_writable,
 )
-from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, refuse_untrained, robot_of, run, to_play
+from hasrl_jax.cli.parsing import (
+    log_to_terminal,
+    policy_to_play,
+    refuse_untrained,
+    robot_of,
+    run,
+    to_play,
+    trained_commands,
+)
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config, EvaluateConfig
@@ -42,9 +50,9 @@ def evaluate(arguments: list[str]) -> None:
     config, parameters = policy_to_play(known, rest, "evaluate")
     robot = robot_of(known)
     task = make_task_on(config, robot) if robot else make_task(config)
-    trained = make_task(policy_to_play(known, [], "evaluate")[0]) if rest else task
+    trained = trained_commands(load_policy_parameters(known.run_dir, known.policy)[0])
     for command in task.commands:
-        refuse_untrained(command.name, command.drawn, trained.commands, known.force)
+        refuse_untrained(command.name, command.drawn, trained, known.force)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )

@@ -32,11 +32,16 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
     """
-    from hasrl_jax.cli.parsing import override_for_policy, policy_to_play, refuse_untrained, robot_of
+    from hasrl_jax.cli.parsing import (
+        override_for_policy,
+        policy_to_play,
+        refuse_untrained,
+        robot_of,
+        trained_commands,
+    )
     from hasrl_jax.config import tasks
     from hasrl_jax.config.convert import from_dict
     from hasrl_jax.envs.gymnasium import TaskEnv
-    from hasrl_jax.envs.registry import make_task
 
     if known.course:
         known.seconds = course.SLICE_S * len(course.sliced(course.COURSES[known.course]))
@@ -45,7 +50,7 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     # The nominal robot, so that the film runs in real time, what was asked for and nothing else, and no time limit.
     cap = max(1, round(known.seconds / config.physics.env_step_s)) + 1
     config = tasks.find(config.task).undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
-    trained = make_task(config).commands
+    trained = trained_commands(config)
     config = override_for_policy(config, rest, "render")
     strip, commands = _strip(known), _commands(known)
     env = TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX, robot_of(known))

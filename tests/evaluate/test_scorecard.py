@@ -218,6 +218,7 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
     ("arguments", "message"),
     [
         (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
+        (["--cassie.command.forward-m-s", "0", "3"], "--forward: got 3; the policy was trained for -0.3 to 2 m/s"),
         (["--against", "zero"], "--against: only a --scorecard compares policies"),
         (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
         (["--scorecard", "DIR", "--seconds", "2"], "--seconds: got 2; expected at least 4"),
