@@ -187,7 +187,7 @@ class CpuEnvs:
         """
         task, model, timestep = self.task, self.task.model, self._physics_step_s(state)
         if task.pace:
-            for own, seconds in zip(self._models, timestep, strict=True):
+            for own, seconds in zip(self._models, np.broadcast_to(timestep, self.num_envs), strict=True):
                 own.opt.timestep = seconds
         self._controls[:, :, : model.nu] = control
         if self._force:

@@ -146,7 +146,7 @@ def test_caption() -> None:
         (["--speeds", "0", "11", "--policy", "released"], "forward"),
         (
             ["--speeds", "0", "2.5", "--policy", "released"],
-            r"^--forward: got 2.5; .* trained for -0.3 to 2 m/s.*--force",
+            "^--forward: got 2.5; .* for -0.3 to 2 m/s.*--force",
         ),
         (["--command", "height=0.6", "--policy", "released-steer"], "^--height: got 0.6; .* trained for 0.65 to 1 m"),
         (["--command", "forward", "--policy", "released"], "--command"),
