@@ -6,8 +6,22 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options, require_writable
-from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, robot_of, run, to_play
+from hasrl_jax.cli.options import (
+    OneLineParser,
+    add_force_option,
+    add_model_options,
+    add_policy_options,
+    require_writable,
+)
+from hasrl_jax.cli.parsing import (
+    log_to_terminal,
+    policy_to_play,
+    refuse_untrained,
+    robot_of,
+    run,
+    to_play,
+    trained_commands,
+)
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.config.limits import check_number
 from hasrl_jax.config.schema import Config, EvaluateConfig
@@ -42,6 +56,9 @@ def evaluate(arguments: list[str]) -> None:
     config, parameters = policy_to_play(known, rest, "evaluate")
     robot = robot_of(known)
     task = make_task_on(config, robot) if robot else make_task(config)
+    trained = trained_commands(load_policy_parameters(known.run_dir, known.policy)[0])
+    for command in task.commands:
+        refuse_untrained(command.name, command.drawn, trained, known.force)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )
@@ -115,6 +132,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         help='more policies for either page: "zero", "random", run directories, files',
     )
     add_model_options(parser)
+    add_force_option(parser)
     known, rest = parser.parse_known_args(arguments)
     if known.episodes is None:
         known.episodes = 150 if known.stairs else 100

@@ -35,6 +35,11 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mapping", type=Path, help="YAML file of the names that differ in --model")
 
 
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """The option of the programs that `parsing.refuse_untrained` guards."""
+    parser.add_argument("--force", action="store_true", help="command what the policy was not trained for, too")
+
+
 def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 

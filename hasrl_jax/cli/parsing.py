@@ -11,18 +11,19 @@ import os
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any
 
 import tyro
 
 from hasrl_jax.cli.options import OneLineParser
-from hasrl_jax.config import strict_yaml, tasks
+from hasrl_jax.config import curriculum, strict_yaml, tasks
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.describe import descriptions
 from hasrl_jax.config.schema import Config
-from hasrl_jax.envs.registry import Robot
+from hasrl_jax.envs.registry import Robot, make_task
+from hasrl_jax.envs.task import Command
 from hasrl_jax.errors import ConfigError, HasrlError
 from hasrl_jax.policy.loading import load_policy_parameters, under_reference_physics
 from hasrl_jax.policy.numpy_networks import Parameters
@@ -123,6 +124,35 @@ def policy_to_play(known: argparse.Namespace, overrides: list[str], program: str
     """
     trained, parameters = load_policy_parameters(known.run_dir, known.policy)
     return to_play(trained, known.physics, overrides, program), parameters
+
+
+def trained_commands(config: Config) -> tuple[Command, ...]:
+    """The commands of a policy's training, each with the widest range that any of its stages drew from."""
+    stages = zip(*(make_task(part).commands for part in curriculum.resolve(config)), strict=True)
+    drawn = [(min(c.drawn[0] for c in command), max(c.drawn[1] for c in command), command[0]) for command in stages]
+    return tuple(command._replace(drawn=(low, high)) for low, high, command in drawn)
+
+
+def refuse_untrained(name: str, asked: Iterable[float], commands: tuple[Command, ...], force: bool) -> None:
+    """Refuses to command what a policy was not trained for, unless it is forced.
+
+    Args:
+      name: of a command, as in `Command.name`; one that is not among `commands` is left to others.
+      asked: values of it.
+      commands: as `trained_commands` returns them.
+      force: whether it is.
+
+    Raises:
+      ConfigError: a value outside of what was drawn, the usual one excepted.
+    """
+    for command in commands:
+        low, high = command.drawn
+        for value in asked:
+            if command.name == name and not force and value != command.default and not low <= value <= high:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')}: got {value:g}; the policy was trained for {low:g} to {high:g} "
+                    f"{command.unit}, and --force commands it all the same"
+                )
 
 
 def robot_of(known: argparse.Namespace) -> Robot | None:

@@ -12,7 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hasrl_jax.cli.options import OneLineParser, add_model_options, add_policy_options, require_writable
+from hasrl_jax.cli.options import (
+    OneLineParser,
+    add_force_option,
+    add_model_options,
+    add_policy_options,
+    require_writable,
+)
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.visualize import course, opengl
 from hasrl_jax.visualize.render import SHADOW_PX, Commands, Push, film, play
@@ -26,7 +32,13 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     Raises:
       ConfigError: an impossible argument; RunError, CheckpointError: no policy; OSError: a file cannot be written.
     """
-    from hasrl_jax.cli.parsing import override_for_policy, policy_to_play, robot_of
+    from hasrl_jax.cli.parsing import (
+        override_for_policy,
+        policy_to_play,
+        refuse_untrained,
+        robot_of,
+        trained_commands,
+    )
     from hasrl_jax.config import tasks
     from hasrl_jax.config.convert import from_dict
     from hasrl_jax.envs.gymnasium import TaskEnv
@@ -38,6 +50,7 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
     # The nominal robot, so that the film runs in real time, what was asked for and nothing else, and no time limit.
     cap = max(1, round(known.seconds / config.physics.env_step_s)) + 1
     config = tasks.find(config.task).undisturbed(from_dict({"collect": {"max_episode_steps": cap}}, config))
+    trained = trained_commands(config)
     config = override_for_policy(config, rest, "render")
     strip, commands = _strip(known), _commands(known)
     env = TaskEnv(config, "rgb_array", known.width, known.height, known.camera, SHADOW_PX, robot_of(known))
@@ -48,6 +61,8 @@ def render(known: argparse.Namespace, rest: list[str]) -> None:
             course.check(known.course, course.COURSES[known.course], env.task.commands)
         for told in commands:
             env.check_command(told)
+            for name, value in told.items():
+                refuse_untrained(name, [value], trained, known.force)
         frames = max(1, round(known.seconds / env.task.env_step_s))
         push = Push(known.push, known.push_at)
         falls = film(env, play(env, parameters, frames, known.seed, push, commands), frames, known.out, strip)
@@ -109,6 +124,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     )
     add_policy_options(parser)
     add_model_options(parser)
+    add_force_option(parser)
     parser.add_argument("--out", type=Path, default=Path("policy.mp4"), help="the video")
     parser.add_argument("--strip", type=Path, help="a row of frames as one PNG; default: beside the video")
     parser.add_argument("--seconds", type=float, default=10.0)

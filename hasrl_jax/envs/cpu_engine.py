@@ -86,7 +86,7 @@ class CpuEnvs:
         """Fresh episodes in all environments."""
         fresh = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
         state = EnvState(
-            physics=np.concatenate([np.zeros((self.num_envs, 1)), fresh.qpos, fresh.qvel], axis=1),
+            physics=_physics(fresh, self.task.model.na),
             task=fresh.state,
             model_fields=fresh.model_fields,
             observation=fresh.observation,
@@ -148,9 +148,14 @@ class CpuEnvs:
         if task.delay is None:
             return control
         earlier, delay_s = task.delay(state.task, np)
-        delay_steps = delay_s / state.model_fields.get("timestep", self._timestep)
+        delay_steps = delay_s / self._physics_step_s(state)
         late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
         return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
+
+    def _physics_step_s(self, state: EnvState) -> np.ndarray | float:
+        """Physics step within the coming environment step, s, [E] or the same for all."""
+        timestep = state.model_fields.get("timestep", self._timestep)
+        return timestep if self.task.pace is None else timestep * self.task.pace(state.task, np)
 
     def keep(self, before: EnvState, after: EnvState, envs: np.ndarray, fields: bool = True) -> EnvState:
         """`after` with the environments numbered `envs` as they were `before`.
@@ -182,7 +187,10 @@ class CpuEnvs:
         Returns:
           The physics state, what the task reads of it, and which simulations diverged, [E] bool.
         """
-        task, model = self.task, self.task.model
+        task, model, timestep = self.task, self.task.model, self._physics_step_s(state)
+        if task.pace:
+            for own, seconds in zip(self._models, np.broadcast_to(timestep, self.num_envs), strict=True):
+                own.opt.timestep = seconds
         self._controls[:, :, : model.nu] = control
         if self._force:
             self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
@@ -202,7 +210,6 @@ class CpuEnvs:
             self.physics_seconds += time.thread_time() - cpu
         end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
-        timestep = state.model_fields.get("timestep", self._timestep)
         elapsed = end[:, 0] - state.physics[:, 0]
         on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
         # A sum is finite where all its numbers are.
@@ -229,8 +236,7 @@ class CpuEnvs:
             return values
 
         physics = state.physics.copy()  # what the task returned may be a view of it
-        physics[envs] = 0.0
-        physics[envs, 1:] = np.concatenate([fresh.qpos[rows], fresh.qvel[rows]], axis=1)
+        physics[envs] = _physics(fresh, self.task.model.na)[rows]
         # These arrays were made for this state alone.
         state.is_first[envs], state.episode_step[envs], state.episode_return[envs] = True, 0, 0.0
         for row, env in zip(range(rows.start, rows.stop), envs, strict=True):
@@ -250,3 +256,9 @@ class CpuEnvs:
                 model.opt.timestep = values[row]
             else:
                 getattr(model, name)[:] = values[row]
+
+
+def _physics(fresh: Reset, activations: int) -> np.ndarray:
+    """The physics state of fresh episodes, [E, nstate]: time, qpos, qvel, and what lags in actuators at rest."""
+    num_envs = len(fresh.qpos)
+    return np.concatenate([np.zeros((num_envs, 1)), fresh.qpos, fresh.qvel, np.zeros((num_envs, activations))], axis=1)

@@ -23,6 +23,7 @@ class Entry(NamedTuple):
     mean: float = 0.0  # where a policy that never saw the quantity is given it: roughly its mean
     std: float = 1.0  # and its standard deviation
     noise: float = 0.0  # half width of the uniform error of a noisy measurement, in the unit
+    scale: float = 1.0  # of an action: what 1 stands for, in the unit
     parts: tuple[str, ...] = ()  # name of each number, where there are several
     note: str = ""  # where and how it is measured
 

@@ -133,13 +133,15 @@ class MjxEngine:
         if task.delay is None:
             return control
         earlier, delay_s = task.delay(state.task, jnp)
-        delay_steps = delay_s / state.model_fields.get("timestep", task.model.opt.timestep)
+        delay_steps = delay_s / self._physics_step_s(state)
         late = jnp.arange(steps) + 0.5 < delay_steps
         return jnp.where(late[:, None], task.control(state.task, earlier, jnp), control)
 
     def simulate(self, state: MjxEnvState, control: Array) -> tuple[Reading, Array]:
         """The physics steps of one environment step under `control` [S, nu]; also the overflow flags [2]."""
         task, fields = self.task, state.model_fields
+        if task.pace:
+            fields = fields | {"timestep": self._physics_step_s(state)}
         if self.curve and "actuator_gainprm" in fields:
             fields = fields | motors.pd_parameters(fields["actuator_gainprm"], jnp)
         model = _with_fields(self.model, fields)
@@ -156,6 +158,11 @@ class MjxEngine:
         total = jnp.zeros_like(task.physics_features(data.sensordata, jnp))
         (data, total), _ = jax.lax.scan(advance_and_sum, (data, total), control)
         return Reading(data.qpos, data.qvel, data.sensordata, total / task.steps_per_env_step), _overflow(data)
+
+    def _physics_step_s(self, state: MjxEnvState) -> Array:
+        """Physics step within the coming environment step, s, []."""
+        timestep = state.model_fields.get("timestep", self.task.model.opt.timestep)
+        return timestep if self.task.pace is None else timestep * self.task.pace(state.task, jnp)
 
     def _keep(self, data: mjx.Data) -> mjx.Data:
         """Only what the next physics step reads; carrying all of it costs a quarter of the time.
@@ -195,6 +202,11 @@ def make_engine(
         raise ConfigError(
             "cassie.terrain.kind: the mjx backend has level ground only; set it to flat, or use cpu_pool "
             "(MJX would compute the contacts with each box of the ground in every physics step)"
+        )
+    if task.model.na:
+        raise ConfigError(
+            f"{task.name}: the mjx backend keeps no state of actuators from one environment step to the next; set "
+            "cassie.randomize.torque_lag_s to 0 0, or use cpu_pool"
         )
     if task.model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ConfigError("physics.solver: MJX has no PGS; set it to Newton")

@@ -23,7 +23,9 @@ from hasrl_jax.types import Array
 STALL_PER_LIMIT = 2.0  # stall torque over the torque that the driver allows: half the no-load speed keeps all of it
 # Where MuJoCo keeps a DC motor's numbers: in `actuator_gainprm`.
 RESISTANCE, CONSTANT, STIFFNESS, DAMPING, VOLTAGE = 0, 1, 4, 6, 7
+LAG = 0  # in `actuator_dynprm`: the time constant of a torque that lags, s
 POSITION_INPUT = 1  # `actuator_ctrlspec`: the control is a target position
+AT_ONCE_S = 1e-9  # time constant of a torque that does not lag; zero is none that MuJoCo takes
 
 
 class Curve(NamedTuple):
@@ -31,6 +33,22 @@ class Curve(NamedTuple):
 
     stall_torque: np.ndarray  # [nu] N m
     no_load_speed: np.ndarray  # [nu] rad/s
+
+
+def let_lag(spec: mujoco.MjSpec) -> None:
+    """Gives every motor of a description a torque that follows with a time constant, for `with_curve`.
+
+    The torque is then part of the physics state, which only compiling can make room for. Gains stay those of PD loops.
+
+        d torque / dt = (asked for - torque) / time constant
+
+    Source: Oregon State University's cassie-mujoco-sim gives a torque 6 physics steps, 3 ms, late. Differs from it: the
+    inductance of a DC motor, which MuJoCo has, delays by its time constant on average, and smooths.
+    """
+    for actuator in spec.actuators:
+        actuator.dyntype, actuator.gaintype = mujoco.mjtDyn.mjDYN_DCMOTOR, mujoco.mjtGain.mjGAIN_DCMOTOR
+        actuator.biastype, actuator.actearly, actuator.actdim = mujoco.mjtBias.mjBIAS_DCMOTOR, True, 1
+        actuator.dynprm[LAG] = AT_ONCE_S
 
 
 def with_curve(model: mujoco.MjModel, no_load_speed: Mapping[str, float]) -> mujoco.MjModel:
@@ -50,6 +68,7 @@ def with_curve(model: mujoco.MjModel, no_load_speed: Mapping[str, float]) -> muj
         places = [RESISTANCE, CONSTANT, STIFFNESS, DAMPING, VOLTAGE]
         model.actuator_gainprm[index, places] = speed / stall, 1.0, stiffness, damping, speed
     model.actuator_biasprm[:] = model.actuator_dynprm[:] = 0
+    model.actuator_dynprm[model.actuator_actnum > 0, LAG] = AT_ONCE_S
     model.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_DCMOTOR
     model.actuator_gaintype[:] = mujoco.mjtGain.mjGAIN_DCMOTOR
     model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_DCMOTOR

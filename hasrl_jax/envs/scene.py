@@ -36,11 +36,11 @@ def place_ground(task: Task, model: mujoco.MjModel, model_fields: dict[str, np.n
       model_fields: of the environments, [E, ...].
       env: the one whose episode it is.
     """
-    if task.ground and "geom_pos" in model_fields:
-        ground = model.geom_bodyid == 0  # the first geoms of any model
-        for name in ("geom_pos", "geom_size", "geom_quat"):
-            if name in model_fields:
-                getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]
+    ground = model.geom_bodyid == 0  # the first geoms of any model
+    for name in ("geom_pos", "geom_size", "geom_quat") if task.ground else ("geom_quat",):
+        if name in model_fields:
+            getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]
+            model.geom_sameframe[ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 class Scene:

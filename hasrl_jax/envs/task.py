@@ -75,6 +75,10 @@ class Task:
     control: Callable[[Any, Array, Any], Array]  # (state, action [..., A], xp) -> ctrl [..., nu]
     step: Callable[[Any, Array, Reading, Array, Any], Transition]  # (state, action, reading, uniforms, xp)
     step_uniforms: int = 0  # uniform [0, 1) numbers that `step` consumes
+    # (state, xp) -> the action [..., A] that still acts at the beginning of an environment step, and for how long, s
+    delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
+    # (state, xp) -> factor on the physics step of the coming environment step [...]; needs models of their own
+    pace: Callable[[Any, Any], Array] | None = None
     measures: tuple[str, ...] = ()
     mirror: Mirror | None = None
     # (sensordata [..., ns], xp) -> [..., F]; nothing is averaged over physics steps by default
@@ -86,8 +90,6 @@ class Task:
     commands: tuple[Command, ...] = ()
     # (state, observation, command [..., C], xp) -> (state, observation): told from now to the end of the episode
     with_command: Callable[[Any, Array, Array, Any], tuple[Any, Array]] | None = None
-    # (state, xp) -> the action [..., A] that still acts at the beginning of an environment step, and for how long, s
-    delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
     # (state, force [..., 2] in N along the world's x and y, xp) -> state: pushed from now for `push_s`
     with_push: Callable[[Any, Array, Any], Any] | None = None
     push_s: float = 0.0

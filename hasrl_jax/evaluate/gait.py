@@ -9,6 +9,7 @@ from hasrl_jax.envs.cassie.task import GRAVITY_M_S2
 
 CONTACT_N = 30.0  # mean ground force in an environment step above which a foot stands; the robot weighs 327 N
 MIN_SWING_S = 0.1  # a foot that scuffs the ground sooner than this after it lifted has not landed
+TRAILING_N = 20.0  # force on a toe behind a lifted heel that counts as trailing
 MIN_TOUCHDOWNS = 4  # of a foot, before its rhythm is spoken of
 
 
@@ -63,6 +64,20 @@ def describe(
         "phase_offset": rhythm * np.array(list(map(phase_offset, landed_left.T, landed_right.T))),
         "cost_of_transport": np.where(np.abs(mean_speed) > 0.1, cost, np.nan),
     }
+
+
+def trailing(left_toe: np.ndarray, right_toe: np.ndarray, step_s: float, steps_per_s: np.ndarray) -> np.ndarray:
+    """How long a foot stays on its toe after its heel has lifted, mean over the steps, s, [N]; NaN without a rhythm.
+
+    Args:
+      left_toe: ground force on the left foot while its heel is up, N, [T, N].
+      right_toe: of the right one.
+      step_s: duration of an environment step.
+      steps_per_s: landings of both feet per second, [N].
+    """
+    seconds = np.maximum(np.isfinite(left_toe).sum(axis=0), 1) * step_s
+    on_toe = sum((np.nan_to_num(force) > TRAILING_N).sum(axis=0) * step_s for force in (left_toe, right_toe))
+    return on_toe / (seconds * steps_per_s)
 
 
 def phase_offset(landed_left: np.ndarray, landed_right: np.ndarray) -> float:

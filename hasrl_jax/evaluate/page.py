@@ -56,6 +56,7 @@ GAIT: tuple[Column, ...] = (
     ("right foot in the left's cycle", "phase_offset", number(2)),
     ("cost of transport", "cost_of_transport", number(2)),
     ("motor power, W", "motor_power", number(0)),
+    ("on the toe, s a step", "trailing_toe_s", number(3)),
 )
 ON_MODEL: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (1, 2, 3, 4, 5, 6))
 SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
@@ -92,7 +93,8 @@ def write_page(report: dict[str, Any], directory: Path) -> None:
             "Gait of the nominal robot",
             "Contacts are seen once per environment step (25 ms), which makes the duty factor read up to 0.03 high; a "
             "step is a landing after 0.1 s or more in the air. The cost of transport is the mean sum of |torque × "
-            "velocity| of the motors over weight × speed.\n",
+            "velocity| of the motors over weight × speed. A foot is on its toe while it bears more than 20 N with its "
+            "heel 1.6 cm or more above it.\n",
             table(select(rows, "speed"), GAIT),
         ),
         (

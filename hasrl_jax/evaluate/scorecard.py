@@ -30,8 +30,8 @@ from hasrl_jax.policy.blas import ONE_THREAD
 from hasrl_jax.policy.numpy_networks import Parameters
 
 log = logging.getLogger("hasrl_jax")
-SPEEDS_M_S = (-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-LATERAL_M_S = (-0.1, 0.1)
+SPEEDS_M_S = (-1.0, -0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+LATERAL_M_S = (-0.5, -0.1, 0.1, 0.5)
 LATERAL_AT_M_S = 0.5  # forward speed of the rows with a lateral command
 CHANGING_M_S = ((-0.3, 2.0), (-0.3, 4.0))  # ranges of the rows whose commands change
 CHANGE_S = (2.0, 6.0)  # seconds between commands
@@ -46,8 +46,15 @@ DISTURBED_AT_M_S = 1.0
 DISTURBANCES: dict[str, dict[str, Any]] = {
     "control delay 10 ms": {"control_delay_s": [0.01, 0.01]},
     "control delay 20 ms": {"control_delay_s": [0.02, 0.02]},
+    "torque 3 ms late": {"torque_lag_s": [0.003, 0.003]},
+    "policy periods x 0.8 to 1.2": {"policy_period_scale": [0.8, 1.2]},
     "noisy observations": {"observation_noise": 1.0},
     "velocity off by up to 0.2 m/s": {"velocity_bias_m_s": 0.2},
+    "velocity 0.1 s late": {"velocity_lag_s": [0.1, 0.1]},
+    "velocity off by up to 0.2 m/s and 0.1 s late": {"velocity_bias_m_s": 0.2, "velocity_lag_s": [0.1, 0.1]},
+    "heading drifts by up to 3 °/s": {"yaw_drift_rad_s": float(np.deg2rad(3.0))},
+    "turned by 45° at the start": {"start_turned_rad": [float(np.pi / 4)] * 2},
+    "turned by 90° at the start": {"start_turned_rad": [float(np.pi / 2)] * 2},
     "10 kg on the pelvis": {"payload_kg": [10.0, 10.0]},
     "pelvis 3 kg lighter": {"payload_kg": [-3.0, -3.0]},
     "center of mass off by up to 5 cm": {"center_of_mass_m": 0.05},
@@ -57,7 +64,17 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
     "springs x 0.8 to 1.2": {"spring_scale": [0.8, 1.2]},
     "friction 0.4": {"sliding_friction": [0.4, 0.4]},
     "friction 0.2": {"sliding_friction": [0.2, 0.2]},
+    "floor sloping by 5°": {"floor_slope_deg": [5.0, 5.0]},
+    "floor sloping by 8°": {"floor_slope_deg": [8.0, 8.0]},
 }
+# Of the ground; blocks of 0.3 to 0.5 m, and steps so long that each is climbed alone.
+GROUNDS: dict[str, dict[str, Any]] = {
+    "ground uneven by ± 1 cm": {"kind": "rough", "step_height_m": [-0.01, 0.01], "step_depth_m": [0.3, 0.5]},
+    "ground uneven by ± 2 cm": {"kind": "rough", "step_height_m": [-0.02, 0.02], "step_depth_m": [0.3, 0.5]},
+    "a step up of 10 cm every 2 m": {"kind": "steps", "step_height_m": [0.1, 0.1], "step_depth_m": [2.0, 2.0]},
+}
+FAST_M_S = 3.0
+DISTURBED_FAST = ("friction 0.4", "friction 0.2", "torque 3 ms late", "velocity 0.1 s late", "ground uneven by ± 2 cm")
 # Draws that leave the nominal robot as it is.
 NOTHING_DRAWN: dict[str, Any] = {
     **{key: [1.0, 1.0] for key in ("damping_scale", "mass_scale", "physics_rate_scale", "sliding_friction")},
@@ -65,8 +82,15 @@ NOTHING_DRAWN: dict[str, Any] = {
     "rolling_friction": [1e-4, 1e-4],
     "encoder_offset_rad": 0.0,
     **{key: [1.0, 1.0] for key in ("pd_gain_scale", "torque_scale", "spring_scale")},
-    **{key: [0.0, 0.0] for key in ("payload_kg", "control_delay_s")},
-    **dict.fromkeys(("center_of_mass_m", "velocity_bias_m_s", "observation_noise"), 0.0),
+    "policy_period_scale": [1.0, 1.0],
+    **{
+        key: [0.0, 0.0]
+        for key in (
+            *("payload_kg", "control_delay_s", "torque_lag_s", "velocity_lag_s"),
+            *("start_turned_rad", "floor_slope_deg"),
+        )
+    },
+    **dict.fromkeys(("center_of_mass_m", "velocity_bias_m_s", "yaw_drift_rad_s", "observation_noise"), 0.0),
 }
 PAPER_DRAWS = (
     "damping_scale",
@@ -85,7 +109,7 @@ FALL = {"min_height_m": 0.6, "max_height_m": 3.0, "max_tilt_deg": 45.0}
 SHORT_S = 20.0  # besides the cap, survival is also told for this long
 # What every row sets itself, of `cassie`.
 SETTINGS = ("command", "motor", "push", "terrain", "termination", "randomize")
-REVISION = 4  # of what a row plays and what its figures mean; those of an earlier one are measured anew
+REVISION = 5  # of what a row plays and what its figures mean; those of an earlier one are measured anew
 MODEL_EPISODES = 20  # of each row on another model
 BATCH = 25  # episodes that one job plays side by side
 
@@ -98,7 +122,7 @@ class Row(NamedTuple):
     lateral_m_s: tuple[float, float] = (0.0, 0.0)
     randomized: bool = False
     push_n: float = 0.0
-    disturbance: str = ""  # one of `DISTURBANCES`
+    disturbance: str = ""  # one of `DISTURBANCES` or `GROUNDS`
     yaw_rate_rad_s: float = 0.0  # heading frame
     height_m: float = 0.0  # heading frame; 0 is the usual one
 
@@ -137,7 +161,8 @@ def rows(trained: Config) -> list[Row]:
         *(Row("push", (v, v), push_n=force) for v in PUSH_SPEEDS_M_S for force in PUSHES_N),
         *(Row("lateral", lateral, (v, v), drawn) for drawn in (False, True) for v in LATERAL_M_S),
         *(Row("speed", (v, v), randomized=True) for v in SPEEDS_M_S),
-        *(Row("disturbance", (DISTURBED_AT_M_S,) * 2, disturbance=name) for name in DISTURBANCES),
+        *(Row("disturbance", (DISTURBED_AT_M_S,) * 2, disturbance=name) for name in (*DISTURBANCES, *GROUNDS)),
+        *(Row("disturbance", (FAST_M_S,) * 2, disturbance=name) for name in DISTURBED_FAST),
         *(_steered_rows() if trained.settings.command.frame == "heading" else ()),
     ]
 
@@ -194,7 +219,7 @@ def row_config(trained: Config, row: Row, seconds: float) -> Config:
             "interval_s": [PUSH_AFTER_S, PUSH_AFTER_S + PUSH_PHASE_S],
             "duration_s": PUSH_S,
         },
-        "terrain": {"kind": "flat"},
+        "terrain": GROUNDS.get(row.disturbance, {"kind": "flat"}),
         "termination": FALL,
     }
     return from_dict(
@@ -382,6 +407,9 @@ def _play(job: tuple[Row, Config, Parameters, int, list[int], Robot | None]) -> 
         column["forward_speed"],
         mass,
         task.env_step_s,
+    )
+    figures["trailing_toe_s"] = gait.trailing(
+        column["left_toe_force"], column["right_toe_force"], task.env_step_s, figures["step_frequency_hz"]
     )
     last = np.maximum(played.episode_length - 1, 0)
     heading = np.unwrap(np.nan_to_num(column["heading"]), axis=0)[last, np.arange(episodes)]

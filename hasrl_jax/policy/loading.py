@@ -104,7 +104,9 @@ def load_initial(config: Config, source: str) -> dict[str, np.ndarray]:
         its, ours = getattr(trained.network, name), getattr(config.network, name)
         if its != ours:
             raise ConfigError(f"network.{name}: got {ours}; --init-policy {source} needs --network.{name} {its}")
-    return _for_observation(parameters, make_task(trained).observation, make_task(config).observation, source)
+    its_task, our_task = make_task(trained), make_task(config)
+    parameters = _for_observation(parameters, its_task.observation, our_task.observation, source)
+    return _for_action(parameters, its_task.action, our_task.action)
 
 
 def _for_observation(
@@ -143,6 +145,25 @@ def _for_observation(
     }
     changed = {name: rows(parameters[name], fill) for name, fill in fills.items() if name in parameters}
     return parameters | changed
+
+
+def _for_action(
+    parameters: dict[str, np.ndarray], its: tuple[Entry, ...], ours: tuple[Entry, ...]
+) -> dict[str, np.ndarray]:
+    """`parameters` of a policy whose actions stand for `its` quantities, for one whose actions stand for `ours`.
+
+    Where an action of 1 stands for r times as much, the head's output z becomes z / r: r tanh(z / r) has the slope of
+    tanh(z) at 0, and goes further where that was near its bound. The exploration stays the same in the unit.
+    """
+    its_scale, our_scale = (np.repeat([e.scale for e in table], [e.size for e in table]) for table in (its, ours))
+    ratio = (its_scale / our_scale).astype(np.float32)
+    if (ratio == 1).all():
+        return parameters
+    return parameters | {
+        "policy/mean_kernel": parameters["policy/mean_kernel"] * ratio,
+        "policy/mean_bias": parameters["policy/mean_bias"] * ratio,
+        "policy/log_std": parameters["policy/log_std"] + np.log(ratio),
+    }
 
 
 def with_parameters(learner: ppo.LearnerState, parameters: dict[str, np.ndarray]) -> ppo.LearnerState:

@@ -332,6 +332,28 @@ def test_measures_for_gait_analysis_are_means_over_the_physics_steps() -> None:
     assert measures["phase"] == state.task.phase[0]
 
 
+@pytest.mark.parametrize(("pitch_deg", "on_toe"), [(-20, False), (3, False), (9, True), (30, True)])
+def test_a_foot_that_points_down_stands_on_its_toe(pitch_deg: float, on_toe: bool) -> None:
+    """MuJoCo's own frame of the foot, of a robot that is tipped over as a whole."""
+    task, constants = _make(**NOMINAL_ROBOT)
+    model, data = task.model, mujoco.MjData(task.model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    ends = [data.geom(f"{side}-foot").xmat.reshape(3, 3)[:, 2] for side in ("left", "right")]
+    flat = np.rad2deg([np.arcsin(-end[2] * np.sign(end[0])) for end in ends])  # how far each points down
+    half = np.deg2rad(pitch_deg - flat.mean()) / 2
+    assert abs(flat[0] - flat[1]) < 0.1 and abs(flat.mean()) < 2
+    data.qpos[3:7] = np.cos(half), 0, np.sin(half), 0
+    mujoco.mj_forward(model, data)
+    reading = _still_reading(task, data.qpos[None].copy())
+    reading.sensordata[:] = data.sensordata
+    reading.sensordata[0, constants.ids.foot_force] = 50.0, 90.0
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    result = task.step(fresh.state, np.zeros((1, 10)), reading, np.zeros((1, task.step_uniforms)), np)
+    first = task.measures.index("left_toe_force")
+    np.testing.assert_allclose(result.measures[0, first : first + 2], [50.0, 90.0] if on_toe else 0)
+
+
 def test_the_clock_advances_by_one_environment_step() -> None:
     task, _ = _make()
     fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
@@ -352,6 +374,15 @@ def test_control_by_hand() -> None:
     expected[0] += [0.5, -0.5, 1.0, -1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0]  # 1.5 and -7 are cut off
     expected[1] -= [0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09]
     np.testing.assert_allclose(task.control(state, action, np), expected, atol=1e-12)
+
+
+def test_an_action_reaches_as_far_as_it_is_set_to() -> None:
+    task, _ = _make(action_range_rad=1.4)
+    fresh = task.reset(np.full((1, task.reset_uniforms), 0.5), np)
+    action = np.array([[0.5, -0.5, 1.0, -1.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    moved = task.control(fresh.state, action, np) - task.control(fresh.state, np.zeros((1, 10)), np)
+    np.testing.assert_allclose(moved, [[0.7, -0.7, 1.4, -1.4, 1.4, 0, 0, 0, 0, 0]], atol=1e-12)
+    assert [entry.scale for entry in task.action] == [1.4]
 
 
 def test_the_policy_reads_the_encoder_that_its_targets_are_tracked_with() -> None:

@@ -66,7 +66,10 @@ def test_the_formulation_of_the_paper_has_the_numbers_it_had(name: str) -> None:
         np.testing.assert_allclose(task.physics_features(reading.sensordata, np), step["features"], rtol=1e-12)
         result = task.step(state, np.array(step["action"]), reading, np.array(step["uniforms"]), np)
         for part in ("observation", "reward", "reward_terms", "terminated", "measures"):
-            np.testing.assert_allclose(getattr(result, part), step[part], rtol=1e-12, atol=1e-12, err_msg=part)
+            found = getattr(result, part)
+            if part in ("reward_terms", "measures"):  # a term without a weight, and the forces on toes, came later
+                found = found[:, : np.shape(step[part])[1]]
+            np.testing.assert_allclose(found, step[part], rtol=1e-12, atol=1e-12, err_msg=part)
         state = result.state
 
 

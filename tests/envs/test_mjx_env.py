@@ -120,6 +120,11 @@ BEYOND_PAPER = {
         "center_of_mass_m": 0.03,
         "control_delay_s": [0, 0.02],
         "velocity_bias_m_s": 0.2,
+        "policy_period_scale": [0.8, 1.2],
+        "velocity_lag_s": [0.02, 0.1],
+        "yaw_drift_rad_s": 0.5,
+        "start_turned_rad": [-0.5, 0.5],
+        "floor_slope_deg": [3, 8],
         "observation_noise": 1.0,
     },
 }

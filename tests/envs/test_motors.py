@@ -12,6 +12,7 @@ from hasrl_jax.envs import motors
 from hasrl_jax.envs.cassie.task import NEUTRAL_RAD, NO_LOAD_SPEED_RAD_S
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.layout import places
+from hasrl_jax.envs.mjx_engine import make_engine
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import ConfigError
@@ -142,3 +143,54 @@ def test_measurements_err_and_the_robot_does_not() -> None:
     assert np.std(state.task.velocity_bias) > 0.1
     assert not error[..., slices["clock"]].any()
     assert not error[..., slices["forward_command"]].any()
+
+
+def _torques(lag_s: float, steps: int) -> np.ndarray:
+    """What the left hip pitch gives after each of some physics steps of 0.5 ms, told to go 1 rad further; [steps]."""
+    randomize = NEUTRAL_SETTINGS | {"enabled": True, "torque_lag_s": [lag_s, lag_s], "spring_scale": [1, 1.0000001]}
+    cassie = {"motor": {"torque_speed_curve": True}, "randomize": randomize}
+    task = make_task(from_dict({"cassie": cassie, "physics": {"timestep_s": 0.0005, "steps_per_env_step": 50}}))
+    envs = CpuEnvs(task, 1, 10)
+    envs.reset(np.random.default_rng(0))
+    model, data = envs._models[0], mujoco.MjData(task.model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    model.opt.gravity[:] = 0
+    torques = []
+    for _ in range(steps):
+        data.ctrl[:] = data.qpos[[model.jnt_qposadr[joint] for joint in model.actuator_trnid[:, 0]]]
+        data.ctrl[2] += 1.0
+        data.qvel[:] = 0
+        mujoco.mj_step(model, data)
+        torques.append(data.actuator_force[2])
+    return np.array(torques)
+
+
+def test_torque_follows_with_its_time_constant() -> None:
+    """A step of the torque that is asked for leaves exp(-t / T) of it missing."""
+    steps = np.arange(1, 21)
+    np.testing.assert_allclose(_torques(0.003, 20), 88 * (1 - np.exp(-steps * 0.0005 / 0.003)), rtol=0.01)
+
+
+def test_a_torque_that_does_not_lag_is_the_one_without_a_state() -> None:
+    """The robots that are not drawn, among some that are: to the last step as if there were no lag."""
+    ends = []
+    for lag in ([0.0, 0.0], [0.002, 0.004]):
+        randomize = {"enabled": True, "share": 0.0, "torque_lag_s": lag, "spring_scale": [0.9, 1.1]}
+        task = make_task(from_dict({"cassie": {"motor": {"torque_speed_curve": True}, "randomize": randomize}}))
+        envs, rng = CpuEnvs(task, 2, 3), np.random.default_rng(0)
+        state = envs.reset(rng)
+        for _ in range(5):  # over the end of an episode
+            state, result = envs.step(state, np.full((2, 10), 0.2), rng)
+            assert not result.diverged.any()
+        assert task.model.na == (10 if lag[1] else 0)
+        ends.append(state.physics[:, : 1 + task.model.nq + task.model.nv])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+
+
+def test_a_lag_needs_motors_with_a_curve_and_a_cpu() -> None:
+    lag = {"randomize": {"torque_lag_s": [0.003, 0.003]}}
+    with pytest.raises(ConfigError, match=r"torque_lag_s: got .*; expected 0 0 unless cassie.motor.torque_speed_curve"):
+        check(from_dict({"cassie": lag}))
+    config = from_dict({"cassie": lag | {"motor": {"torque_speed_curve": True}}})
+    with pytest.raises(ConfigError, match=r"set cassie.randomize.torque_lag_s to 0 0, or use cpu_pool"):
+        make_engine(make_task(config), "jax", 10)

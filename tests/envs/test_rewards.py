@@ -57,7 +57,7 @@ def test_pelvis_motion_counts_shaking() -> None:
 
 def test_weights_of_the_paper() -> None:
     terms = rewards.weighted_terms(_errors(), PAPER, np)
-    np.testing.assert_allclose(terms, [0, 0, 0.4, 0.3, 0.3, 0.1, 0.05, 0.05])  # no error, no clock score
+    np.testing.assert_allclose(terms, [0, 0, 0.4, 0.3, 0.3, 0.1, 0.05, 0.05, 0])  # no error, no clock score
     best = math.tan(0.3 * math.pi)  # one foot at its limit, as its clock asks
     terms = rewards.weighted_terms(_errors(foot_force=best, foot_velocity=best), PAPER, np)
     assert terms.sum() == pytest.approx(2 * (0.4 * best + 0.6))
@@ -105,6 +105,7 @@ def test_a_whole_step_by_hand() -> None:
         0.1 * math.exp(-0.7),
         0.05 * math.exp(-0.25 * 4.0),
         0.05 * math.exp(-5 * 0.1),
+        0,
     ]
     np.testing.assert_allclose(result.reward_terms[0], expected, rtol=1e-9, atol=1e-12)
     assert result.reward[0] == pytest.approx(sum(expected))
@@ -123,6 +124,12 @@ def test_departures_from_the_paper_are_settings() -> None:
     assert result.reward_terms[0, 3] == pytest.approx(0.3 * math.exp(-(0.5 + 0.25)))
 
 
+def test_the_power_of_the_motors_has_a_term_of_its_own() -> None:
+    _, task = _task(dataclasses.replace(PAPER, motor_power=0.1, motor_power_w=120.0))
+    result, _ = _step(_task(PAPER)[0], task)  # its motors take 60 W
+    assert result.reward_terms[0, 8] == pytest.approx(2.0 * 0.1 * math.exp(-0.5))
+
+
 def test_zero_action_changes_nothing_and_terms_sum_to_the_reward() -> None:
     _, task = _task(PAPER)
     envs = CpuEnvs(task, 3, 100)
@@ -130,7 +137,7 @@ def test_zero_action_changes_nothing_and_terms_sum_to_the_reward() -> None:
     state = envs.reset(rng)
     for _ in range(5):
         state, result = envs.step(state, np.zeros((3, 10)), rng)
-        np.testing.assert_allclose(result.reward_terms[:, -1], 0.05)  # e^-0: the action never changes
+        np.testing.assert_allclose(result.reward_terms[:, 7], 0.05)  # e^-0: the action never changes
         np.testing.assert_allclose(result.reward_terms.sum(axis=1), result.reward)
         assert (result.reward_terms[:, 2:] >= 0).all()
-        assert (result.reward_terms[:, 2:] <= [0.4, 0.3, 0.3, 0.1, 0.05, 0.05]).all()
+        assert (result.reward_terms[:, 2:] <= [0.4, 0.3, 0.3, 0.1, 0.05, 0.05, 0]).all()

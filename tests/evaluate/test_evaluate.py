@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hasrl_jax.cli import evaluate as cli_evaluate
+from hasrl_jax.cli import parsing
 from hasrl_jax.cli import render as cli_render
 from hasrl_jax.cli.evaluate import main as evaluate_main
 from hasrl_jax.config.convert import from_dict
@@ -207,3 +208,18 @@ def test_render_says_what_is_wrong_on_one_line():
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: --seconds: invalid float value: 'soon'\n"
+
+
+def test_a_policy_was_trained_for_the_widest_of_its_stages():
+    stages = [
+        {"at_env_steps": 10, "set": {"cassie.command.forward_m_s": [-0.5, 2.0]}},
+        {"at_env_steps": 20, "set": {"cassie.command.forward_m_s": [0.0, 3.0]}},
+    ]
+    forward, lateral = parsing.trained_commands(from_dict({"stages": stages}))
+    assert (forward.drawn, lateral.drawn) == ((-0.5, 3.0), (-0.1, 0.1))
+    for value in (-0.5, 3.0, 0.0):
+        parsing.refuse_untrained("forward", [value], (forward, lateral), False)
+    with pytest.raises(ConfigError, match=r"^--forward: got -0.6; the policy was trained for -0.5 to 3 m/s"):
+        parsing.refuse_untrained("forward", [1.0, -0.6], (forward, lateral), False)
+    parsing.refuse_untrained("forward", [-9.0], (forward, lateral), True)
+    parsing.refuse_untrained("jump", [9.0], (forward, lateral), False)

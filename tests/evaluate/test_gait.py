@@ -63,3 +63,18 @@ def test_standing_and_flying_have_no_rhythm(force: float) -> None:
     still = np.full((200, 1), force)
     figures = gait.describe(still, still, 0 * still, 0 * still, 33.0, STEP_S)
     assert all(np.isnan(figures[name]).all() for name in figures)
+
+
+def test_time_on_the_toe_counts_per_step() -> None:
+    """Three environment steps of 60 N after each of 20 stances of the left foot, two of 15 N after the right one's."""
+    left, right = _walk(cycle=30, stance=18, shift=15)
+    toes = []
+    for force, steps, newtons in ((left, 3, 60.0), (right, 2, 15.0)):
+        toe = np.zeros_like(force)
+        for end in np.flatnonzero(np.diff(force[:, 0]) < 0):
+            toe[end + 1 : end + 1 + steps] = newtons
+        toes.append(toe)
+    per_second = np.array([2 / (30 * STEP_S)])
+    np.testing.assert_allclose(gait.trailing(*toes, STEP_S, per_second), 3 * STEP_S / 2, rtol=0.05)
+    halved = [np.where(np.arange(len(toe))[:, None] < len(toe) // 2, toe, np.nan) for toe in toes]  # a fall
+    np.testing.assert_allclose(gait.trailing(*halved, STEP_S, per_second), 3 * STEP_S / 2, rtol=0.1)

@@ -22,8 +22,11 @@ def test_rows_cover_what_is_asked() -> None:
     assert len({(row.title, row.randomized) for row in rows}) == len(rows)
     for randomized in (False, True):
         speeds = {row.forward_m_s[0] for row in rows if row.kind == "speed" and row.randomized == randomized}
-        assert speeds == {-0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0}
+        assert speeds == {-1.0, -0.3, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0}
     assert {row.push_n for row in rows if row.kind == "push"} == {50, 100, 150, 200, 250, 300}
+    hindered = {(row.disturbance, row.forward_m_s[0]) for row in rows if row.kind == "disturbance"}
+    assert {("friction 0.4", 1.0), ("friction 0.2", 1.0), ("friction 0.4", 3.0), ("friction 0.2", 3.0)} <= hindered
+    assert {name for name, _ in hindered} == {*scorecard.DISTURBANCES, *scorecard.GROUNDS}
     steered = scorecard.rows(shipped("cassie_steer"))
     assert steered[: len(rows)] == rows
     assert {row.kind for row in steered[len(rows) :]} == {"steering", "turn", "sidestep", "height"}
@@ -40,6 +43,12 @@ def test_a_disturbance_is_the_only_one() -> None:
         "friction 0.4": {"geom_friction"},
         "control delay 10 ms": set(),
         "noisy observations": set(),
+        "velocity off by up to 0.2 m/s and 0.1 s late": set(),
+        "heading drifts by up to 3 °/s": set(),
+        "turned by 90° at the start": set(),
+        "policy periods x 0.8 to 1.2": set(),
+        "floor sloping by 8°": {"geom_quat"},
+        "torque 3 ms late": {"actuator_dynprm"},
     }
     for name, fields in changed.items():
         task = scorecard.make_task(
@@ -51,6 +60,21 @@ def test_a_disturbance_is_the_only_one() -> None:
             field for field, values in drawn.items() if not np.allclose(values, getattr(nominal, field), rtol=1e-9)
         }
         assert differ == fields, name
+
+
+def test_the_ground_of_a_row_is_the_only_thing_that_is_not_nominal() -> None:
+    heights = {"ground uneven by ± 2 cm": (-0.02, 0.02), "a step up of 10 cm every 2 m": (0.1, 0.1)}
+    for name, height in heights.items():
+        row = Row("disturbance", (1.0, 1.0), disturbance=name)
+        task = scorecard.make_task(scorecard.row_config(shipped("cassie_steer"), row, 20.0))
+        fields = task.reset(np.random.default_rng(0).random((2, task.reset_uniforms)), np).model_fields
+        differ = {field for field, found in fields.items() if field != "timestep"}
+        differ = {field for field in differ if not np.allclose(fields[field], getattr(task.model, field), rtol=1e-9)}
+        assert differ <= {"geom_pos", "geom_size", "bvh_aabb", "geom_friction"}
+        ground = task.model.geom_bodyid == 0
+        np.testing.assert_allclose(fields["geom_friction"][:, ~ground], task.model.geom_friction[None, ~ground][[0, 0]])
+        rise = fields["geom_pos"][:, 1:3, 2] - fields["geom_pos"][:, :1, 2]  # of the first blocks above the start
+        assert (rise > height[0] - 1e-9).all() and (rise < 2 * height[1] + 1e-9).all() and rise.any()
 
 
 def test_a_row_of_steering_commands_all_dimensions() -> None:
@@ -195,6 +219,7 @@ def test_a_card_that_is_interrupted_keeps_what_it_has(tmp_path: Path, monkeypatc
     [
         (["--scorecard", "DIR", "--json", "x.json"], "--scorecard: writes its own files"),
         (["--against", "zero"], "--against: only a --scorecard or --stairs compares policies"),
+        (["--cassie.command.forward-m-s", "0", "3"], "--forward: got 3; the policy was trained for -0.3 to 2 m/s"),
         (["--scorecard", "DIR", "--against", "nobody"], "nobody"),
         (["--scorecard", "DIR", "--seconds", "2"], "--seconds: got 2; expected at least 4"),
         (["--scorecard", "DIR", "--cassie.push.force-n", "0", "9"], "--cassie.push.force-n: a scorecard sets it"),

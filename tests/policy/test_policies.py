@@ -138,6 +138,24 @@ def test_a_policy_goes_on_in_a_task_that_shows_it_more() -> None:
     np.testing.assert_allclose(means["yaw_rate"][120:].mean(axis=0), 0.4, atol=0.1)
 
 
+def test_a_policy_goes_on_where_actions_reach_further() -> None:
+    """What it asks for in rad stays the same near the neutral pose, and its exploration everywhere."""
+    config = from_dict({"cassie": {"action_range_rad": 1.25}}, shipped("cassie_steer"))
+    own, parameters = policies.load_policy_parameters(None, "released-steer")
+    ours = policies.load_initial(config, "released-steer")
+    mirror = make_task(own).mirror
+    observation = np.random.default_rng(0).normal(size=(5, 52)) * parameters["normalizer/std"]
+    observation += parameters["normalizer/mean"]
+    arguments = np.zeros((5, 2, 2, 128), np.float32), np.ones(5, bool), mirror
+    inputs = numpy_policy.streams(observation, parameters, mirror)
+    before, _ = numpy_policy.policy_step(parameters, inputs, *arguments)
+    after, _ = numpy_policy.policy_step(ours, inputs, *arguments)
+    np.testing.assert_allclose(np.arctanh(after), np.arctanh(before) / 1.25, rtol=2e-3, atol=1e-5)
+    np.testing.assert_allclose(1.25 * np.exp(ours["policy/log_std"]), np.exp(parameters["policy/log_std"]), rtol=1e-6)
+    kept = {name for name in parameters if np.array_equal(parameters[name], ours[name])}
+    assert parameters.keys() - kept == {"policy/mean_kernel", "policy/mean_bias", "policy/log_std"}
+
+
 def test_a_policy_that_wants_to_see_more_than_there_is_is_refused(tmp_path: Path) -> None:
     config = shipped("cassie_steer")
     path = tmp_path / "steer.npz"

@@ -144,6 +144,11 @@ def test_caption() -> None:
         (["--out", "film.gif"], "--out"),
         (["--speeds", "0", "nan"], "--speeds"),
         (["--speeds", "0", "11", "--policy", "released"], "forward"),
+        (
+            ["--speeds", "0", "2.5", "--policy", "released"],
+            "^--forward: got 2.5; .* for -0.3 to 2 m/s.*--force",
+        ),
+        (["--command", "height=0.6", "--policy", "released-steer"], "^--height: got 0.6; .* trained for 0.65 to 1 m"),
         (["--command", "forward", "--policy", "released"], "--command"),
         (["--command", "jump=1", "--policy", "released"], "jump"),
         (["--yaw-rate", "1", "--policy", "released"], "yaw_rate"),

@@ -14,6 +14,7 @@ from hasrl_jax.envs import motors
 from hasrl_jax.envs.cassie.ids import NO_NAMES, SIDES
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
 from hasrl_jax.envs.draws import between
+from hasrl_jax.envs.layout import columns
 from hasrl_jax.types import Array
 
 DAMPED_JOINTS = ("hip-roll", "hip-yaw", "hip-pitch", "achilles-rod", "knee", "shin", "tarsus", "foot-crank", "foot")
@@ -27,7 +28,13 @@ BEYOND_PAPER = {
     "payload_kg": 1,
     "center_of_mass_m": 3,
     "control_delay_s": 1,
+    "torque_lag_s": 1,
     "velocity_bias_m_s": 2,
+    "velocity_lag_s": 1,
+    "yaw_drift_rad_s": 1,
+    "start_turned_rad": 1,
+    "floor_slope_deg": 2,  # and its direction
+    "policy_period_scale": 0,
     "observation_noise": 0,
 }
 
@@ -41,15 +48,18 @@ class Nominal(NamedTuple):
     body_ipos: np.ndarray  # [nbody, 3]
     dof_damping: np.ndarray  # [nv]
     geom_friction: np.ndarray  # [ngeom, 3]
+    geom_quat: np.ndarray  # [ngeom, 4]
     jnt_stiffness: np.ndarray  # [njnt]
     actuator_gainprm: np.ndarray  # [nu, 10]
     actuator_biasprm: np.ndarray  # [nu, 10]
     actuator_forcerange: np.ndarray  # [nu, 2]
+    actuator_dynprm: np.ndarray  # [nu, 10]
     subtree: np.ndarray  # [nbody, nbody] 1 where the column's body hangs on the row's body
     dof_draw: np.ndarray  # [nv] which damping draw scales this degree of freedom, -1 for none
     num_damping: int
     springs: np.ndarray  # [4] joints of the leaf springs
     pelvis: int  # body
+    is_floor: np.ndarray  # [ngeom] bool: the planes of the world
     gain_columns: np.ndarray  # [10] 1 where `actuator_gainprm` holds a PD gain
     weights: "WeightTerms"
 
@@ -89,15 +99,18 @@ def nominal(
         body_ipos=model.body_ipos.copy(),
         dof_damping=model.dof_damping.copy(),
         geom_friction=model.geom_friction.copy(),
+        geom_quat=model.geom_quat.copy(),
         jnt_stiffness=model.jnt_stiffness.copy(),
         actuator_gainprm=model.actuator_gainprm.copy(),
         actuator_biasprm=model.actuator_biasprm.copy(),
         actuator_forcerange=model.actuator_forcerange.copy(),
+        actuator_dynprm=model.actuator_dynprm.copy(),
         subtree=subtree,
         dof_draw=np.array([damped.index(joint) if joint in damped else -1 for joint in model.dof_jntid]),
         num_damping=len(damped),
         springs=np.array([model.joint(joints.get(name, name)).id for name in springs]),
         pelvis=model.body(bodies.get(PELVIS, PELVIS)).id,
+        is_floor=(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_bodyid == 0),
         gain_columns=gain_columns,
         weights=_weight_terms(model),
     )
@@ -137,7 +150,7 @@ def num_uniforms_beyond(config: RandomizeConfig) -> int:
 
 def beyond(uniforms: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
     """The draws that the paper does not have, by setting; uniform numbers [..., num_uniforms_beyond]."""
-    shift, bias = config.center_of_mass_m, config.velocity_bias_m_s
+    shift, bias, drift = config.center_of_mass_m, config.velocity_bias_m_s, config.yaw_drift_rad_s
     bounds = {
         "pd_gain_scale": config.pd_gain_scale,
         "torque_scale": config.torque_scale,
@@ -145,10 +158,19 @@ def beyond(uniforms: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array
         "payload_kg": config.payload_kg,
         "center_of_mass_m": (-shift, shift),
         "control_delay_s": config.control_delay_s,
+        "torque_lag_s": config.torque_lag_s,
         "velocity_bias_m_s": (-bias, bias),
+        "velocity_lag_s": config.velocity_lag_s,
+        "yaw_drift_rad_s": (-drift, drift),
+        "start_turned_rad": config.start_turned_rad,
+        "floor_slope_deg": (0.0, 1.0),
     }
     parts = xp.split(uniforms, np.cumsum([BEYOND_PAPER[name] for name in bounds])[:-1], axis=-1)
-    return {name: between(part, ends) for (name, ends), part in zip(bounds.items(), parts, strict=True)}
+    draws = {name: between(part, ends) for (name, ends), part in zip(bounds.items(), parts, strict=True)}
+    steepness, direction = (draws["floor_slope_deg"][..., i] for i in range(2))
+    angle = 2 * np.pi * direction
+    rise = xp.tan(np.deg2rad(1.0) * between(steepness, config.floor_slope_deg))
+    return draws | {"floor_slope": rise[..., None] * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)}
 
 
 def is_drawn(uniforms: Array, config: RandomizeConfig) -> Array:
@@ -200,6 +222,14 @@ def model_fields(
         payload = xp.where(drawn, draws["payload_kg"], 0.0) / constants.body_mass[constants.pelvis]
         mass_scale = mass_scale + on_pelvis * payload
         fields = _fields_beyond(draws, drawn, on_pelvis, constants, xp)
+        if max(config.torque_lag_s) > 0:
+            lag = xp.maximum(xp.where(drawn, draws["torque_lag_s"], 0.0), motors.AT_ONCE_S)
+            is_lag = np.arange(constants.actuator_dynprm.shape[1]) == motors.LAG
+            fields["actuator_dynprm"] = xp.where(is_lag, lag[..., None], constants.actuator_dynprm)
+        if max(config.floor_slope_deg) > 0:
+            slope = xp.where(drawn, draws["floor_slope"], 0.0)
+            floor = constants.is_floor[:, None]
+            fields["geom_quat"] = xp.where(floor, tilted(slope, xp)[..., None, :], constants.geom_quat)
     mass = constants.body_mass * mass_scale
     body_weight, dof_weight = inverse_weights(mass_scale, constants.weights, xp)
     return fields | {
@@ -230,6 +260,17 @@ def _fields_beyond(
         "jnt_stiffness": constants.jnt_stiffness * (1 + (spring - 1) @ is_spring.T),
         "body_ipos": constants.body_ipos + on_pelvis[:, None] * shift[..., None, :],
     }
+
+
+def tilted(slope: Array, xp: Any) -> Array:
+    """Orientation (w, x, y, z) of a plane that rises by `slope` m per m along x and y: [..., 2] -> [..., 4].
+
+    Half the angle between its normal n = (-slope, 1) / |(-slope, 1)| and the vertical, about their cross product: the
+    quaternion (1 + n_z, -n_y, n_x, 0) made a unit.
+    """
+    length = xp.sqrt(1 + (slope**2).sum(axis=-1))
+    quat = columns([length + 1, slope[..., 1], -slope[..., 0], xp.zeros_like(length)], xp)
+    return quat / xp.sqrt((quat**2).sum(axis=-1, keepdims=True))
 
 
 def inverse_weights(mass_scale: Array, terms: WeightTerms, xp: Any) -> tuple[Array, Array]:

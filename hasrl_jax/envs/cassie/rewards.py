@@ -3,7 +3,7 @@
 r = s (w1 S_F + w2 S_V + w3 e^-(E_pel+E_foot) + w4 e^-P_m + w5 e^-E_v + w6 e^-H_p + w7 e^-T_p + w8 e^-A_p)
 
 Source: paper section II.C and Table I; the definitions behind the symbols are those of the
-published implementation.
+published implementation. Differs from the paper: a ninth term, the power of the motors, whose usual weight is zero.
 """
 
 from typing import Any
@@ -23,6 +23,7 @@ TERMS = (
     "hip_roll",
     "torque_change",
     "action_change",
+    "motor_power",
 )
 MAX_FOOT_FORCE_N = 350.0
 STAND_FOOT_FORCE_N = 120.0  # a foot under less than half of the robot's 320 N counts as planted
@@ -30,6 +31,8 @@ MAX_FOOT_SPEED_M_S = 2.0
 CLOCK_GAIN = 1.2
 # World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
 NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
+_W, _X, _Y, _Z = NEUTRAL_FOOT_QUAT
+TOE_AXIS = np.array([1 - 2 * (_Y**2 + _Z**2), 2 * (_X * _Y - _W * _Z), 2 * (_X * _Z + _W * _Y)])  # ahead, in its frame
 
 
 def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -> Array:
@@ -101,7 +104,7 @@ def pelvis_motion(
 
 
 def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> Array:
-    """The weighted, scaled terms in the order of `TERMS`, [..., 8]; their sum is the reward.
+    """The weighted, scaled terms in the order of `TERMS`, [..., 9]; their sum is the reward.
 
     `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
     non-negative error E whose exp(-E) is rewarded.

@@ -63,6 +63,9 @@ class RewardConfig:
     hip_roll: Annotated[float, Limits(-1e6, 1e6)] = 0.050  # w6, weight of exp(-H_p)
     torque_change: Annotated[float, Limits(-1e6, 1e6)] = 0.025  # w7, weight of exp(-T_p)
     action_change: Annotated[float, Limits(-1e6, 1e6)] = 0.025  # w8, weight of exp(-A_p)
+    motor_power: Annotated[float, Limits(-1e6, 1e6)] = 0.0  # weight of exp(-power / motor_power_w) (the paper: none)
+    # mechanical power of all motors at which that term has fallen to a third, W
+    motor_power_w: Annotated[float, Limits(1, 1e6)] = 300.0
     velocity_sharpness: Annotated[float, Limits(0, 1e3)] = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
     # weight of the lateral speed error in E_v (the paper: 0)
     lateral_velocity_share: Annotated[float, Limits(0, 1e3)] = 1.0
@@ -103,8 +106,20 @@ class RandomizeConfig:
     center_of_mass_m: Share = 0.0  # half width of the shift of the pelvis' center of mass along each axis, m
     # time until new targets reach the motors, one draw per episode, s; a policy period at most
     control_delay_s: Annotated[Range, Limits(0, 1)] = (0.0, 0.0)
+    # time constant with which a motor's torque follows, one draw per episode, s; cassie.motor.torque_speed_curve only
+    torque_lag_s: Annotated[Range, Limits(0, 0.1)] = (0.0, 0.0)
+    # factor on the duration of an environment step, hence on the physics step, drawn anew for every one
+    policy_period_scale: Annotated[Range, Limits(0.05, 10)] = (1.0, 1.0)
     # half width of the error of the observed forward and lateral velocity, constant in an episode, m/s
     velocity_bias_m_s: Annotated[float, Limits(0, 10)] = 0.0
+    # time constant with which the observed velocity follows the true one, one draw per episode, s
+    velocity_lag_s: Annotated[Range, Limits(0, 10)] = (0.0, 0.0)
+    # half width of the rate at which the observed heading, and the velocity with it, turns away, rad/s
+    yaw_drift_rad_s: Annotated[float, Limits(0, 10)] = 0.0
+    # how far to the left of the heading to keep an episode starts, rad
+    start_turned_rad: Annotated[Range, Limits(-3.1416, 3.1416)] = (0.0, 0.0)
+    # steepness of the floor, rising towards any direction, deg
+    floor_slope_deg: Annotated[Range, Limits(0, 30)] = (0.0, 0.0)
     # factor on the noise of each observation, which is drawn anew at every environment step
     observation_noise: Annotated[float, Limits(0, 100)] = 0.0
 
@@ -192,6 +207,8 @@ class TerminationConfig:
 class CassieConfig:
     # height above the ground and velocity in the observation: state, the true ones; blind, what encoders and IMU give
     observe: Literal["state", "blind"] = "state"
+    # furthest PD target from the neutral pose, which an action of 1 asks for, rad (the paper: 1)
+    action_range_rad: Annotated[float, Limits(0.1, 3)] = 1.0
     command: CommandConfig = field(default_factory=CommandConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)

@@ -35,13 +35,29 @@ def check(config: Config) -> None:
     )
     _check_reference(config)
     if settings.randomize.enabled:
-        scale, timestep_s = settings.randomize.physics_rate_scale, config.physics.timestep_s
-        low, high = limits_of(PhysicsConfig, "timestep_s")
         require(
-            low <= timestep_s * scale[0] and timestep_s * scale[1] <= high,
-            "cassie.randomize.physics_rate_scale",
-            scale,
-            f"physics steps from {low:g} to {high:g} s, where physics.timestep_s is {timestep_s:g}",
+            settings.motor.torque_speed_curve or settings.randomize.torque_lag_s[1] == 0,
+            "cassie.randomize.torque_lag_s",
+            settings.randomize.torque_lag_s,
+            "0 0 unless cassie.motor.torque_speed_curve is true",
+        )
+        timestep_s = config.physics.timestep_s
+        low, high = limits_of(PhysicsConfig, "timestep_s")
+        shortest = longest = timestep_s
+        for name in ("physics_rate_scale", "policy_period_scale"):  # they multiply
+            scale = getattr(settings.randomize, name)
+            shortest, longest = shortest * scale[0], longest * scale[1]
+            require(
+                low <= shortest and longest <= high,
+                f"cassie.randomize.{name}",
+                scale,
+                f"physics steps from {low:g} to {high:g} s, where physics.timestep_s is {timestep_s:g}",
+            )
+        require(
+            settings.terrain.kind == "flat" or settings.randomize.floor_slope_deg[1] == 0,
+            "cassie.randomize.floor_slope_deg",
+            settings.randomize.floor_slope_deg,
+            "0 0 unless cassie.terrain.kind is flat",
         )
 
 

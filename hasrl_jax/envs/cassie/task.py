@@ -65,6 +65,7 @@ ACTION = (
     Entry("motor_targets", "rad", MOTOR_SIGNS, legs=True, parts=_MOTOR_NAMES, note="relative to the neutral pose"),
 )
 ACTION_SIZE = layout.size(ACTION)
+LIFT_M = 0.2  # an episode on a slope starts higher by what the floor rises over so far, or feet would be in it
 # No-load speed of each motor over the ratio of its gear: the joint's speed at which it gives no torque, rad/s.
 # Source: `user` and `gear` of the actuators in Oregon State University's cassie.xml (revolutions per minute).
 NO_LOAD_SPEED_RAD_S = {
@@ -76,6 +77,7 @@ NUM_ENCODERS = len(MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 # which has +0.0045 for both hip rolls; the sign here makes the two legs mirror images.
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
+HEEL_UP = 0.1  # sine of the angle by which a foot points down: of its 0.16 m the heel is 1.6 cm up
 MEASURES = (
     *("forward_speed", "lateral_speed"),  # of the pelvis in the command's frame, at the end of the step, m/s
     *("forward_command", "lateral_command"),  # that held during the environment step, m/s
@@ -83,6 +85,8 @@ MEASURES = (
     *("left_force", "right_force"),  # ground force on each foot, mean over the physics steps, N
     "motor_power",  # sum of |torque * joint velocity| over the motors, mean over the physics steps, W
     "phase",  # of the gait clock by which the environment step was judged, [0, 1)
+    # ground force on a foot whose heel is up, at the end of the environment step, N
+    *("left_toe_force", "right_toe_force"),
 )
 HEADING_MEASURES = (
     "yaw_rate",  # of the pelvis about the vertical at the end of the environment step, rad/s
@@ -109,8 +113,15 @@ class CassieState(NamedTuple):
     action: Array  # [..., 10] previous action
     torque: Array  # [..., 10] joint torques at the end of the previous environment step, N m
     env_step_s: Array  # [...] duration of an environment step in this episode, s
+    is_drawn: Array  # [...] bool: the robot is not the nominal one
+    period_scale: Array  # [...] factor on the duration of the coming environment step
     delay_s: Array  # [...] time until new targets reach the motors, s
     velocity_bias: Array  # [..., 2] error of the observed forward and lateral velocity, m/s
+    velocity_lag_s: Array  # [...] time constant with which the observed velocity follows, s
+    late_velocity: Array  # [..., 3] what has followed so far, of the pelvis in the world, m/s
+    yaw_drift: Array  # [...] how fast the observed heading turns away, rad/s
+    yaw_error: Array  # [...] how far it has, rad
+    slope: Array  # [..., 2] rise of the floor along x and y, m per m
     noise: Array  # [...] factor on the noise of the observations
 
 
@@ -160,10 +171,21 @@ def make_on(config: Config, file: Path, mapping: Mapping[str, Any]) -> Task:
 
 
 def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] | None, names: Names) -> Task:
-    model = load_model(asset, config.physics, ground)
+    lags = config.settings.randomize.enabled and max(config.settings.randomize.torque_lag_s) > 0
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        if ground:
+            ground(spec)
+        if lags:
+            motors.let_lag(spec)
+
+    model = load_model(asset, config.physics, edit)
     if config.settings.motor.torque_speed_curve:
         speeds = {f"{side}-{name}": speed for side in SIDES for name, speed in NO_LOAD_SPEED_RAD_S.items()}
         model = motors.with_curve(model, speeds)
+    if max(config.settings.randomize.floor_slope_deg) > 0:
+        # Compiled, a level floor needs no orientation of its own, and C MuJoCo would not look at one.
+        model.geom_sameframe[model.geom_bodyid == 0] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     nominal = randomize.nominal(model, names.joints, names.bodies)
     ids = cassie_ids(model, names.joints, names.sensors)
     library = gaits.load(config.settings.reference.gaits) if config.settings.reference.gaits else None
@@ -194,14 +216,15 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         model=model,
         steps_per_env_step=config.physics.steps_per_env_step,
         observation=observation_entries(config.settings),
-        action=ACTION,
+        action=action_entries(config.settings),
         reset_uniforms=randomize.num_uniforms(nominal) + drawn_at_reset + noisy,
-        step_uniforms=drawn + noisy,
+        step_uniforms=drawn + noisy + has_uneven_periods(config.settings.randomize),
         reward_terms=reward_terms(config.settings),
         measures=MEASURES + (HEADING_MEASURES if in_heading else ()),
         mirror=layout.mirror(observation_entries(config.settings), ACTION),
         reset=partial(reset, constants),
         control=partial(control, constants),
+        pace=pace if has_uneven_periods(config.settings.randomize) else None,
         delay=delay if max(config.settings.randomize.control_delay_s) > 0 else None,
         force=partial(force, constants),
         disturbed=config.settings.push.force_n[1] > 0,
@@ -239,6 +262,16 @@ def follows_reference(config: CassieConfig) -> bool:
 def bounds(constants: Constants) -> dict[str, tuple[float, float]]:
     """What can be commanded where the gaits there are bound it, by the field of the command's range."""
     return constants.library.bounds if constants.library and follows_reference(constants.config) else {}
+
+
+def action_entries(config: CassieConfig) -> tuple[Entry, ...]:
+    """All that the policy decides, in order."""
+    return tuple(entry._replace(scale=config.action_range_rad) for entry in ACTION)
+
+
+def has_uneven_periods(config: RandomizeConfig) -> bool:
+    """Whether environment steps differ in their duration within an episode."""
+    return config.enabled and config.policy_period_scale != (1.0, 1.0)
 
 
 def noise_size(config: CassieConfig) -> int:
@@ -292,12 +325,14 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     fields = randomize.model_fields(model_u, more_u, nominal, config.randomize, xp)
     is_drawn = randomize.is_drawn(model_u, config.randomize)
     hidden = hidden_draws(more_u, is_drawn, config.randomize, xp)
+    slope = hidden["slope"]
     timestep = fields["timestep"] if fields else xp.full(batch, nominal.timestep)
     offset = xp.where(is_drawn, config.randomize.encoder_offset_rad, 0.0)
     command, command_s = commands.draw_command(command_u, config.command, config.reward.height_m, xp)
     push, push_s = commands.draw_push(push_u, config.push, xp)
     half = config.command.start_heading_rad
     yaw = between(heading_u[..., 0], (-half, half)) if in_heading else xp.zeros(batch)
+    turned = hidden.pop("start_turned")
     qpos = xp.zeros((*batch, len(constants.start_qpos))) + constants.start_qpos
     moving = xp.where(start_u < config.command.start_moving, command, 0.0)
     turn = xp.zeros((*batch, 4))
@@ -308,9 +343,14 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
     if config.reference.start_share > 0:
         begins = gait_u[..., 0] < config.reference.start_share
         qpos, qvel, phase = start_in_gait(constants, begins, (qpos, qvel, phase), command, xp)
+    if max(config.randomize.floor_slope_deg) > 0:
+        lift = LIFT_M * xp.sqrt((slope**2).sum(axis=-1, keepdims=True))
+        qpos = xp.concatenate([qpos[..., :2], qpos[..., 2:3] + lift, qpos[..., 3:]], axis=-1)
+    if in_heading or config.randomize.start_turned_rad != (0.0, 0.0):
+        facing = frames.turned_quaternion(qpos[..., 3:7], yaw + turned, xp)
+        qpos = xp.concatenate([qpos[..., :3], facing, qpos[..., 7:]], axis=-1)
     if in_heading:
-        upright = frames.turned_quaternion(qpos[..., 3:7], yaw, xp)
-        qpos = xp.concatenate([frames.turned(qpos[..., :3], yaw, xp), upright, qpos[..., 7:]], axis=-1)
+        qpos = xp.concatenate([frames.turned(qpos[..., :3], yaw, xp), qpos[..., 3:]], axis=-1)
         qvel = xp.concatenate([frames.turned(qvel[..., :3], yaw, xp), qvel[..., 3:]], axis=-1)
     state = CassieState(
         phase=phase,
@@ -328,6 +368,10 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         action=xp.zeros((*batch, ACTION_SIZE)),
         torque=xp.zeros((*batch, ACTION_SIZE)),
         env_step_s=timestep * constants.steps_per_env_step,
+        is_drawn=is_drawn,
+        period_scale=xp.ones(batch),
+        late_velocity=qvel[..., :3],
+        yaw_error=xp.zeros(batch),
         **hidden,
     )
     if constants.legs is not None:  # a robot that was blind before the episode, too, knows its velocity
@@ -382,15 +426,25 @@ def following_phase(constants: Constants, state: CassieState, xp: Any) -> Array:
 
 
 def hidden_draws(uniforms: Array, is_drawn: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
-    """What an episode draws of delays and measurements: fields of `CassieState`."""
+    """What an episode draws of delays, measurements and the ground: fields of `CassieState`, and `start_turned`."""
     batch = is_drawn.shape
+    scalars = ("delay_s", "velocity_lag_s", "yaw_drift", "start_turned", "noise")
+    nothing = dict.fromkeys(scalars, xp.zeros(batch)) | dict.fromkeys(("velocity_bias", "slope"), xp.zeros((*batch, 2)))
     if not uniforms.shape[-1]:
-        return {"delay_s": xp.zeros(batch), "velocity_bias": xp.zeros((*batch, 2)), "noise": xp.zeros(batch)}
+        return nothing
     draws = randomize.beyond(uniforms, config, xp)
+    drawn = {
+        "delay_s": draws["control_delay_s"][..., 0],
+        "velocity_bias": draws["velocity_bias_m_s"],
+        "velocity_lag_s": draws["velocity_lag_s"][..., 0],
+        "yaw_drift": draws["yaw_drift_rad_s"][..., 0],
+        "start_turned": draws["start_turned_rad"][..., 0],
+        "slope": draws["floor_slope"],
+        "noise": xp.full(batch, config.observation_noise),
+    }
     return {
-        "delay_s": xp.where(is_drawn, draws["control_delay_s"][..., 0], 0.0),
-        "velocity_bias": xp.where(is_drawn[..., None], draws["velocity_bias_m_s"], 0.0),
-        "noise": xp.where(is_drawn, config.observation_noise, 0.0),
+        name: xp.where(is_drawn.reshape(batch + (1,) * (values.ndim - len(batch))), values, nothing[name])
+        for name, values in drawn.items()
     }
 
 
@@ -408,7 +462,13 @@ def control(constants: Constants, state: CassieState, action: Array, xp: Any) ->
     about: Array = NEUTRAL_RAD
     if constants.config.reference.residual:
         about = reference_motion(constants, state, xp)["motor_positions"]
-    return xp.minimum(xp.maximum(action, -1.0), 1.0) + about - state.encoder_offset[..., :ACTION_SIZE]
+    targets = constants.config.action_range_rad * xp.minimum(xp.maximum(action, -1.0), 1.0) + about
+    return targets - state.encoder_offset[..., :ACTION_SIZE]
+
+
+def pace(state: CassieState, xp: Any) -> Array:
+    """Factor on the physics step of the coming environment step, [...]."""
+    return state.period_scale
 
 
 def force(constants: Constants, state: CassieState, xp: Any) -> Array:
@@ -468,19 +528,24 @@ def step(
     yaw = frames.heading(quat, xp)
     measured = [velocity[..., :2], layout.columns([told["forward"], told["lateral"], height, yaw], xp)]
     measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
+    measured.append(toe_force(constants, reading.sensordata, xp))
     if config.command.frame == "heading":
         yaw_rate = (up * reading.qvel[..., 3:6]).sum(axis=-1)
         error = frames.wrapped(yaw - state.target_heading, xp)
         measured.append(layout.columns([yaw_rate, told["yaw_rate"], told["height"], error], xp))
     measures = xp.concatenate(measured, axis=-1)
 
-    drawn, elapsed_s = commands.num_uniforms(config.command), state.env_step_s
+    drawn, elapsed_s = commands.num_uniforms(config.command), duration_s(state)
     command_u, push_u = uniforms[..., :drawn], uniforms[..., drawn : drawn + commands.PUSH_UNIFORMS]
-    noise_u = uniforms[..., drawn + commands.PUSH_UNIFORMS :]
+    noise_u = uniforms[..., drawn + commands.PUSH_UNIFORMS :][..., : noise_size(config)]
     push, push_s = commands.next_push(state.push, state.push_s, elapsed_s, push_u, config.push, xp)
     command, command_s = commands.next_command(
         state.command, state.command_s, elapsed_s, command_u, config.command, config.reward.height_m, xp
     )
+    state = estimate(constants, state, reading.qvel, xp)
+    if has_uneven_periods(config.randomize):
+        scale = between(uniforms[..., -1], config.randomize.policy_period_scale)
+        state = state._replace(period_scale=xp.where(state.is_drawn, scale, 1.0))
     state = state._replace(
         phase=following_phase(constants, state, xp),
         standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
@@ -500,16 +565,21 @@ def observe(
     constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, noise_u: Array, xp: Any
 ) -> Array:
     """The inputs of the policy, [..., O], as `observation_entries` lists them; `noise_u`: [..., noise_size]."""
-    ids, offset = constants.ids, state.encoder_offset
-    velocity = seen_velocity(constants, state, qvel, xp)
+    config, ids, offset = constants.config, constants.ids, state.encoder_offset
+    seen, orientation = state.late_velocity, qpos[..., 3:7]
+    if config.randomize.enabled and config.randomize.yaw_drift_rad_s > 0:
+        seen = frames.turned(seen, state.yaw_error, xp)
+        orientation = frames.turned_quaternion(orientation, state.yaw_error, xp)
+    velocity = seen_velocity(constants, state, seen, xp)
     biased = velocity[..., :2] + state.velocity_bias
     if constants.legs is None:
-        height = (qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, xp))[..., None]
+        height = qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, xp)
+        height = (height - slope_height(config, state, qpos, xp))[..., None]
     else:
         height = state.estimate[..., :1]
     values = {
         "pelvis_height": height,
-        "pelvis_orientation": pelvis_orientation(constants, state, qpos, xp),
+        "pelvis_orientation": pelvis_orientation(constants, state, orientation, xp),
         "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
         "pelvis_velocity": xp.concatenate([biased, velocity[..., 2:]], axis=-1),
         "pelvis_angular_velocity": qvel[..., 3:6],
@@ -522,8 +592,15 @@ def observe(
     observation = xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
     if not noise_u.shape[-1]:
         return observation
-    width = layout.noise(observation_entries(constants.config))
+    width = layout.noise(observation_entries(config))
     return observation + state.noise[..., None] * width * (2 * noise_u - 1)
+
+
+def toe_force(constants: Constants, sensordata: Array, xp: Any) -> Array:
+    """Ground force on each foot while it points down and so stands on its toe, else 0, N, [..., 2]."""
+    ids = constants.ids
+    up = frames.up_in_body_frame(sensordata[..., ids.foot_orientation], xp)
+    return xp.where((up * rewards.TOE_AXIS).sum(axis=-1) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
 
 
 def with_command(
@@ -553,11 +630,11 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     In the heading frame the error of both is bounded: a robot that was turned or pushed away goes on from where it is
     at the commanded speeds, and need not return.
     """
-    config, moved = constants.config.command, state.command[..., commands.PLANAR] * state.env_step_s[..., None]
+    config, moved = constants.config.command, state.command[..., commands.PLANAR] * duration_s(state)[..., None]
     if config.frame == "world":
         return state._replace(path=state.path + moved)
     told = commands.named(state.command, config)
-    target = state.target_heading + told["yaw_rate"] * state.env_step_s
+    target = state.target_heading + told["yaw_rate"] * duration_s(state)
     error, limit = frames.wrapped(target - frames.heading(qpos[..., 3:7], xp), xp), config.max_heading_error_rad
     target = frames.wrapped(target - error + xp.clip(error, -limit, limit), xp)
     drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
@@ -572,7 +649,7 @@ def next_lag(state: CassieState, velocity: Array, memory_s: float, xp: Any) -> A
 
     A steady error of the speed settles at about `memory` times itself, so a robot that sets off is given time.
     """
-    step_s = state.env_step_s[..., None]
+    step_s = duration_s(state)[..., None]
     return state.lag * xp.exp(-step_s / memory_s) + (state.command[..., :2] - velocity) * step_s
 
 
@@ -591,15 +668,33 @@ def told_to_stand(config: CassieConfig, command: Array, xp: Any) -> Array:
     return (command[..., commands.MOTION] == 0).all(axis=-1)
 
 
-def pelvis_orientation(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
+def duration_s(state: CassieState) -> Array:
+    """Of the environment step that is about to begin or has just ended, s, [...]."""
+    return state.env_step_s * state.period_scale
+
+
+def estimate(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> CassieState:
+    """`state` with what a state estimator would say of velocity and heading after an environment step.
+
+    The velocity v is followed with the time constant T, as a low-pass filter does: the estimate moves by the share
+    1 - exp(-duration / T) of its distance from v.
+    """
+    settings, late, elapsed = constants.config.randomize, qvel[..., :3], duration_s(state)
+    if settings.enabled and max(settings.velocity_lag_s) > 0:
+        share = -xp.expm1(-elapsed / xp.maximum(state.velocity_lag_s, 1e-6))
+        late = state.late_velocity + share[..., None] * (late - state.late_velocity)
+    return state._replace(late_velocity=late, yaw_error=state.yaw_error + state.yaw_drift * elapsed)
+
+
+def pelvis_orientation(constants: Constants, state: CassieState, quat: Array, xp: Any) -> Array:
     """Quaternion (w, x, y, z) of the pelvis in the world, or relative to the heading to keep, [..., 4]."""
     if constants.config.command.frame == "world":
-        return qpos[..., 3:7]
-    return frames.turned_quaternion(qpos[..., 3:7], -state.target_heading, xp)
+        return quat
+    return frames.turned_quaternion(quat, -state.target_heading, xp)
 
 
 def pelvis_velocity(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> Array:
-    """Linear velocity along the axes of the world, or along the heading to keep, m/s, [..., 3].
+    """Linear velocity along the axes of the world, or along the heading to keep, m/s, [..., 3]; `qvel`: [..., 3 or nv].
 
     Not along the pelvis's own heading: it sways with every step, which at 4 m/s is 0.3 m/s of apparent lateral speed.
     """
@@ -667,7 +762,7 @@ def reward_errors(
         most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
     foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
     height = height_above_ground(constants, state, reading.qpos, xp)
-    orientation = pelvis_orientation(constants, state, reading.qpos, xp)
+    orientation = pelvis_orientation(constants, state, reading.qpos[..., 3:7], xp)
     pelvis_error = 1.0 - orientation[..., 0] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     velocity = pelvis_velocity(constants, state, reading.qvel, xp)
     velocity_error = xp.abs(velocity[..., :2] - state.command[..., commands.PLANAR])
@@ -694,6 +789,7 @@ def reward_errors(
         "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
         "torque_change": 0.25 * (torque_change.sum(axis=-1) / ACTION_SIZE),
         "action_change": 5 * (xp.abs(action - state.action).sum(axis=-1) / ACTION_SIZE),
+        "motor_power": reading.averages[..., -1] / settings.motor_power_w,
     }
 
 
@@ -735,4 +831,10 @@ def seen_by_tracking(
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
     """Height of the pelvis above the ground, m, [...], as the reward and the termination count it."""
     half_length_m = constants.config.terrain.average_m
-    return qpos[..., 2] - terrain.mean_height(qpos[..., 0], half_length_m, state.terrain, xp)
+    height = qpos[..., 2] - terrain.mean_height(qpos[..., 0], half_length_m, state.terrain, xp)
+    return height - slope_height(constants.config, state, qpos, xp)
+
+
+def slope_height(config: CassieConfig, state: CassieState, qpos: Array, xp: Any) -> Array | float:
+    """Height of a sloping floor under the pelvis, m, [...]."""
+    return (state.slope * qpos[..., :2]).sum(axis=-1) if max(config.randomize.floor_slope_deg) > 0 else 0.0

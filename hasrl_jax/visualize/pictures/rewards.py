@@ -19,14 +19,15 @@ LINE, FAINT, COMMAND = "#1f6f8b", "#a9c9d6", "#333333"
 
 
 def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
-    """Commanded and measured speed above, the eight terms in small panels below; thick lines average a gait cycle."""
+    """Commanded and measured speed above, its terms in small panels below; thick lines average a gait cycle."""
     from matplotlib.figure import Figure
 
     recording = record(config, parameters, list(SPEEDS_M_S), SECONDS_EACH, seed)
     time_s, measures = recording.time_s, recording.measures
     cycle_s = clock.cycle_seconds(np.mean(SPEEDS_M_S), config.settings.clock, np)
     span = max(1, round(cycle_s / time_s[0]))
-    rows: list[Any] = [list(TERMS[first : first + 2]) for first in range(0, len(TERMS), 2)]
+    shown = [name for name in TERMS if getattr(config.settings.reward, name)]
+    rows: list[Any] = [list(shown[first : first + 2]) for first in range(0, len(shown), 2)]
     rows[-1] += ["."] * (2 - len(rows[-1]))  # an empty place beside the last of an odd number
     figure = Figure(figsize=(8.5, 1.6 + 1.2 * len(rows)), layout="constrained")
     panels = figure.subplot_mosaic([["speed", "speed"], *rows], sharex=True)
@@ -37,7 +38,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
     speed.set_title("forward speed, m/s", loc="left", fontsize=9)
     speed.set_xlim(0, SECONDS_EACH * len(SPEEDS_M_S))
     speed.legend(fontsize=8, ncols=3, frameon=False, loc="lower right")
-    for name in TERMS:
+    for name in shown:
         panel, values = panels[name], recording.reward_terms[name]
         weight = config.settings.reward.scale * getattr(config.settings.reward, name)
         panel.plot(time_s, values, color=FAINT, linewidth=0.8)
@@ -52,7 +53,7 @@ def draw(config: Config, parameters: Parameters, seed: int) -> "Figure":
         panel.spines[["top", "right"]].set_visible(False)
         for change in SECONDS_EACH * np.arange(1, len(SPEEDS_M_S)):
             panel.axvline(change, color=COMMAND, linewidth=0.6, alpha=0.4)
-    for name in TERMS[-2:]:
+    for name in shown[-2:]:
         panels[name].set_xlabel("time, s", fontsize=9)
     total = sum(values.mean() for values in recording.reward_terms.values())
     ending = f"; fell after {time_s[-1]:.1f} s" if recording.fell else ""

@@ -201,7 +201,7 @@ def readout(view: View, commands: tuple[Command, ...], pace: float) -> list[tupl
     """Names and values to show beside the robot. `pace`: simulated per elapsed time."""
     measures = view.measures
     rows = [("time", f"{view.time_s:.1f} s")]
-    shown = {"left_force", "right_force", "motor_power", "phase", "heading"}
+    shown = {"left_force", "right_force", "left_toe_force", "right_toe_force", "motor_power", "phase", "heading"}
     for command in commands:
         if command.measure in measures:
             rows.append((command.name.replace("_", " "), followed(command, measures)))
