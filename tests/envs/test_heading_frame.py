@@ -50,6 +50,7 @@ def test_the_formulation_of_the_paper_has_the_numbers_it_had(name: str) -> None:
         "command": {"frame": "world", "resample_s": [0.03, 0.06], "start_moving": 0.5},
         "push": {"force_n": [50, 200], "interval_s": [0.02, 0.05]},
         "randomize": {"enabled": True},
+        "reward": {"foot_force": 0.2, "foot_velocity": {"paper": 0.2, "cassie_walk": 0.12}[name]},
     }
     task = make_task(from_dict({"cassie": changes}, shipped(name)))
     assert (task.reset_uniforms, task.step_uniforms) == (recorded["reset_uniforms"], recorded["step_uniforms"])
