@@ -33,7 +33,7 @@ log = logging.getLogger("hasrl_jax")
 SPEEDS_M_S = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 RISES_M = (0.05, 0.1, 0.125, 0.15, 0.175, 0.2)
 AT_RISE_M, AT_SPEED_M_S = 0.15, 0.75  # of the rows in which the other one varies
-STAIRS = {
+STAIRS: dict[str, Any] = {
     "kind": "steps",
     "step_depth_m": [0.24, 0.4],
     "step_noise_m": 0.01,
