@@ -170,4 +170,4 @@ def test_statistics_say_where_the_time_goes(collector):
     _, statistics = collector("cassie").collect()
     spent = [statistics[f"{item}_cpu_seconds"] for item in ("physics", "inference", "environment")]
     assert min(spent) > 0
-    assert len(statistics["reward_terms"]) == 8
+    assert len(statistics["reward_terms"]) == 9

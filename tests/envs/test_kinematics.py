@@ -12,7 +12,7 @@ from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout
 from hasrl_jax.envs.cassie import kinematics
 from hasrl_jax.envs.cassie import task as cassie
-from hasrl_jax.envs.cassie.ids import cassie_ids
+from hasrl_jax.envs.cassie.ids import MOTOR_SIGNS, cassie_ids
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Reading, Task
@@ -188,7 +188,7 @@ def test_numpy_equals_jax_and_the_mirror_image_is_the_mirror_image(frame: str) -
         np.testing.assert_allclose(other, mine, atol=1e-4)
     # Mirrored: legs swapped with rolls and yaws negated, axial and polar vectors, as the layout says of each.
     angle, speed, turning, quat, acceleration, velocity, elapsed = arrays
-    signs = np.array([*cassie._MOTOR_SIGNS, *cassie._PASSIVE_SIGNS])
+    signs = np.array([*MOTOR_SIGNS, *cassie._PASSIVE_SIGNS])
     swap = np.array([*range(5, 10), *range(5), *range(13, 16), *range(10, 13)])
     axial, polar = np.array(layout.AXIAL), np.array(layout.VECTOR)
     mirrored = [signs * angle[:, swap], signs * speed[:, swap], axial * turning, np.array(layout.QUATERNION) * quat]

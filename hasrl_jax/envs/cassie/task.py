@@ -815,7 +815,7 @@ def seen_by_tracking(
         motor_speeds=reading.qvel[..., ids.motor_qvel],
         springs=reading.qpos[..., ids.passive_qpos[[0, 3]]],
         position=xp.concatenate([from_path, height[..., None]], axis=-1),
-        orientation=pelvis_orientation(constants, state, reading.qpos, xp),
+        orientation=pelvis_orientation(constants, state, reading.qpos[..., 3:7], xp),
         velocity=pelvis_velocity(constants, state, reading.qvel, xp),
         command=layout.columns([told["forward"], told["lateral"], yaw_rate], xp),
         angular_velocity=reading.qvel[..., 3:6],
