@@ -79,6 +79,8 @@ class Task:
     mirror: Mirror | None = None
     # (sensordata [..., ns], xp) -> [..., F]; nothing is averaged over physics steps by default
     physics_features: Callable[[Array, Any], Array] = lambda sensordata, xp: sensordata[..., :0]
+    # sensors of which only the last physics step is read; `physics_features` finds nothing valid in their place
+    end_sensors: tuple[str, ...] = ()
     force: Callable[[Any, Any], Array] | None = None  # (state, xp) -> force from outside on each qvel [..., nv]
     # puts ground that changes by episode into a copy of the model
     ground: Callable[[mujoco.MjSpec], None] | None = None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.convert import from_dict
-from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
+from hasrl_jax.envs.cpu_engine import SPLIT_FROM, CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.registry import make_task
 
 TASK = make_task(from_dict({}))
@@ -141,22 +141,29 @@ def test_restored_environments_go_on_identically() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_batch_equals_plain_mujoco() -> None:
-    envs = CpuEnvs(TASK, 2, 100)
+@pytest.mark.parametrize("num_envs", [2, SPLIT_FROM])
+def test_the_batch_equals_plain_mujoco(num_envs: int) -> None:
+    envs = CpuEnvs(TASK, num_envs, 100)
     rng = np.random.default_rng(3)
     state = envs.reset(rng)
-    action = rng.uniform(-0.5, 0.5, (2, 10))
-    after, _ = envs.step(state, action, rng)
-    for env in range(2):
+    control = TASK.control(state.task, rng.uniform(-0.5, 0.5, (num_envs, 10)), np)
+    end, reading, diverged = envs._simulate(state, control[:, None])
+    assert not diverged.any()
+    for env in (0, num_envs - 1):
         model = make_task(from_dict({})).model
         model.opt.timestep = state.model_fields["timestep"][env]
         for name in set(state.model_fields) - {"timestep"}:
             getattr(model, name)[:] = state.model_fields[name][env]
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = np.split(state.physics[env, 1:], [model.nq])
-        data.ctrl[:] = TASK.control(state.task, action, np)[env]
-        mujoco.mj_step(model, data, TASK.steps_per_env_step)
-        np.testing.assert_array_equal(after.physics[env], [data.time, *data.qpos, *data.qvel])
+        data.ctrl[:] = control[env]
+        features = []
+        for _ in range(TASK.steps_per_env_step):
+            mujoco.mj_step(model, data)
+            features.append(TASK.physics_features(data.sensordata.copy(), np))
+        np.testing.assert_array_equal(end[env], [data.time, *data.qpos, *data.qvel])
+        np.testing.assert_array_equal(reading.sensordata[env], data.sensordata)
+        np.testing.assert_allclose(reading.averages[env], np.mean(features, axis=0), rtol=1e-12)
 
 
 def test_prepared_episodes_end_with_their_generator() -> None:
@@ -185,9 +192,10 @@ def test_episodes_that_follow_one_another_differ() -> None:
     assert len(set(phases)) == len(phases)
 
 
-def test_only_robots_that_differ_have_models_of_their_own() -> None:
+def test_only_robots_that_differ_have_fields_of_their_own() -> None:
     nominal = make_task(from_dict({"cassie": {"randomize": {"enabled": False}}}))
-    for task, expected in ((nominal, 1), (TASK, 3)):
+    for task, drawn in ((nominal, False), (TASK, True)):
         envs = CpuEnvs(task, 3, 100)
-        envs.reset(np.random.default_rng(0))
-        assert len({id(model) for model in envs._models}) == expected
+        state = envs.reset(np.random.default_rng(0))
+        assert set(envs._fields) == set(state.model_fields)
+        assert bool(envs._fields) == drawn
