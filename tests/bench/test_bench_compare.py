@@ -139,17 +139,28 @@ def test_bad_input_is_one_line(
 
 def test_scaling_measures_every_number_of_workers(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     sizes = ["--task", "cartpole", "--envs-per-worker", "2", "--steps-per-env", "4", "--hidden", "8"]
-    figures = figures_of(["scaling", *sizes, "--num-workers", "2", "--rounds", "1", "--json", str(tmp_path / "s.json")])
-    one, two = figures["cells"]
+    few = ["--num-workers", "2", "--rounds", "1", "--updates", "1", "--cores", "1"]
+    figures = figures_of(["scaling", *sizes, *few, "--json", str(tmp_path / "s.json")])
+    one, two, pinned = figures["cells"]
     assert (one["num_workers"], two["num_workers"]) == (1, 2)
+    assert (pinned["num_workers"], pinned["cores"]) == (1, 1)
+    costs = figures["costs"]
+    assert costs["env_steps"] == 8
+    assert all(costs[name] > 0 for name in ("step_s", "update_s"))
+    per_second = 1 / (costs["step_s"] + (costs["fixed_s"] + costs["per_worker_s"]) / 8)
+    assert one["predicted_env_steps_per_second"] == pytest.approx(per_second)
+    assert {(cell["cores"], cell["devices"]) for cell in figures["model"]} >= {(8, 1), (256, 8)}
     assert two["env_steps"] == 2 * one["env_steps"] == 16
     assert one["share_of_ideal"] == 1
     assert two["ideal_env_steps_per_second"] in (one["env_steps_per_second"], 2 * one["env_steps_per_second"])
     timed = ("export_seconds", "broadcast_seconds", "merge_seconds", "pad_seconds", "worker_own_mb")
     assert all(cell[name] > 0 for cell in (one, two) for name in timed)
-    assert "min(cores, workers) x one" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "min(cores, workers) x one" in output
+    assert "Workers that keep one learner busy" in output
 
 
-def test_scaling_refuses_no_rounds(capsys: pytest.CaptureFixture) -> None:
-    assert main(["scaling", "--task", "cartpole", "--rounds", "0"]) == 2
-    assert "--rounds" in capsys.readouterr().err
+@pytest.mark.parametrize("option", ["--rounds", "--updates", "--cores", "--device-speed"])
+def test_scaling_refuses_nothing(option: str, capsys: pytest.CaptureFixture) -> None:
+    assert main(["scaling", "--task", "cartpole", option, "0"]) == 2
+    assert f"{option}: got 0" in capsys.readouterr().err
