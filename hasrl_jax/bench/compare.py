@@ -1,7 +1,8 @@
 """`bench compare`: this project against two usual ways to train a recurrent policy on a gymnasium environment.
 
-    sb3    stable-baselines3-contrib: RecurrentPPO on SubprocVecEnv
-    torch  gymnasium's AsyncVectorEnv with a recurrent PPO of our own in torch, `compare_torch`
+    sb3           stable-baselines3-contrib: RecurrentPPO on SubprocVecEnv
+    sb3_make_vec  the same on `gymnasium.make_vec`, that is on this project's engine
+    torch         gymnasium's AsyncVectorEnv with a recurrent PPO of our own in torch, `compare_torch`
 
 All of them train on the same task in the same run. A short search first gives each peer its best number of
 environments and threads; then rounds of ours and of the peers alternate, and medians are quoted.
@@ -34,10 +35,9 @@ from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.train.devices import prepare_jax
 
 # peer -> the distributions that it needs, by the module that each provides
-NEEDS = {
-    "sb3": {"torch": "torch", "stable_baselines3": "stable-baselines3", "sb3_contrib": "sb3-contrib"},
-    "torch": {"torch": "torch"},
-}
+SB3 = {"torch": "torch", "stable_baselines3": "stable-baselines3", "sb3_contrib": "sb3-contrib"}
+NEEDS = {"sb3": SB3, "sb3_make_vec": SB3, "torch": {"torch": "torch"}}
+IN_ONE_PROCESS = {"sb3_make_vec": (16, 32, 64)}  # peers that step all environments themselves -> numbers to try
 CLEARLY = 1.1  # less is the noise of a short search
 SINGLE_STEPS = 2000  # of the lone environment, per round
 EQUAL = (
@@ -45,7 +45,8 @@ EQUAL = (
     "networks, GAE, Adam, no observation normalisation, no mirror, no early stop by KL, processes on one thread."
 )
 UNEQUAL = (
-    "Not equal: ours steps many environments in each process, the peers one, because their vector environments do; "
+    "Not equal: ours steps many environments in each process, the peers one, because their vector environments do "
+    "(but `sb3_make_vec`, which steps all of them on our engine, in one process, between its inferences); "
     "our environment costs more CPU time alone than in a batch (row `single`, one process without a policy), and "
     "`torch` and `sb3` pay that. Ours has a tanh after each LSTM layer. sb3 cuts its minibatches at episodes instead "
     "of every unroll, has one optimiser for both networks and standardises advantages per minibatch. The peers "
@@ -80,7 +81,11 @@ def measure(arguments: argparse.Namespace) -> dict:
         if smallest < 1:
             raise ConfigError(f"--{name}: got {smallest}; expected at least 1")
     prepare_jax(config)
-    searched = [cell for peer in arguments.peers for cell in search(peer, config, choices, arguments.threads)]
+    searched = [
+        cell
+        for peer in arguments.peers
+        for cell in search(peer, config, in_one_process(peer, choices, config), arguments.threads)
+    ]
     finalists = [cell for peer in arguments.peers for cell in best([c for c in searched if c["name"] == peer])]
     cells = measure_rounds(config, finalists, arguments.rounds)
     return {
@@ -127,6 +132,12 @@ def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> 
         refused = next(number for number in asked if number not in choices)
         raise ConfigError(f"--num-envs: got {refused}; expected a divisor of {sequences[0]} and {sequences[1]}")
     return choices or [1]
+
+
+def in_one_process(peer: str, choices: list[int], config: Config) -> list[int]:
+    """`choices`, or for a peer that steps all environments in one process those of its own that divide a minibatch."""
+    own = [number for number in IN_ONE_PROCESS.get(peer, ()) if config.ppo.minibatch_trajectories % number == 0]
+    return own or choices
 
 
 def require_packages(peers: list[str]) -> None:
@@ -187,7 +198,8 @@ def measure_rounds(config: Config, finalists: list[dict], rounds: int) -> list[d
             def peer_iterate(peer: PeerProcess = peer, threads: int = threads) -> dict[str, float]:
                 return speeds(plan.env_steps, *peer.iterate(threads))
 
-            contestants.append((cell["name"], num_envs, num_envs, threads, peer.parameters, peer_iterate))
+            processes = 1 if cell["name"] in IN_ONE_PROCESS else num_envs
+            contestants.append((cell["name"], num_envs, processes, threads, peer.parameters, peer_iterate))
         measured = [[contestant[-1]() for contestant in contestants] for _ in range(rounds + 1)]
     labels = ("name", "num_envs", "processes", "threads", "parameters")
     cells = []

@@ -67,21 +67,55 @@ class Batch(NamedTuple):
     target: torch.Tensor  # [B, T]
 
 
-class Learner:
-    """The two networks, their optimisers, and the environments' state between iterations."""
+class Networks:
+    """The two networks and their optimisers."""
 
     def __init__(
-        self, envs: gymnasium.vector.VectorEnv, ppo: PPOConfig, hidden_size: int, initial_log_std: float, seed: int
+        self, observation_size: int, action_size: int, ppo: PPOConfig, hidden_size: int, initial_log_std: float
     ):
-        torch.manual_seed(seed)
-        observation_size = envs.single_observation_space.shape[0]  # type: ignore[index]
-        self.envs, self.ppo = envs, ppo
-        self.policy = Policy(observation_size, envs.single_action_space.shape[0], hidden_size, initial_log_std)  # type: ignore[index]
+        self.ppo = ppo
+        self.policy = Policy(observation_size, action_size, hidden_size, initial_log_std)
         hidden = nn.Linear(observation_size, hidden_size), nn.Tanh(), nn.Linear(hidden_size, hidden_size), nn.Tanh()
         self.value = nn.Sequential(*hidden, nn.Linear(hidden_size, 1), nn.Flatten(-2))
         settings = {"eps": ppo.adam_epsilon}
         self.policy_optimizer = torch.optim.Adam(self.policy.parameters(), ppo.policy_learning_rate, **settings)
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), ppo.value_learning_rate, **settings)
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers both networks have."""
+        return sum(part.numel() for network in (self.policy, self.value) for part in network.parameters())
+
+    def update(self, batch: Batch) -> None:
+        """All epochs and minibatches of one iteration."""
+        for _ in range(self.ppo.epochs):
+            for rows in torch.randperm(len(batch.target)).split(self.ppo.minibatch_trajectories):
+                part = Batch(*(field[rows] for field in batch))
+                _descend(self.policy, self.policy_optimizer, self._policy_loss(part), self.ppo)
+                _descend(self.value, self.value_optimizer, self._value_loss(part), self.ppo)
+
+    def _policy_loss(self, part: Batch) -> torch.Tensor:
+        carry = part.hidden.transpose(0, 1), part.cell.transpose(0, 1)
+        mean = self.policy.sequences(part.observation, carry, part.is_first)
+        distribution = torch.distributions.Normal(mean, self.policy.log_std.exp(), validate_args=False)
+        ratio = (distribution.log_prob(part.action).sum(-1) - part.log_prob).exp()
+        clipped = ratio.clamp(1 - self.ppo.clip, 1 + self.ppo.clip)
+        return -torch.minimum(ratio * part.advantage, clipped * part.advantage).mean()
+
+    def _value_loss(self, part: Batch) -> torch.Tensor:
+        return 0.5 * (self.value(part.observation) - part.target).square().mean()
+
+
+class Learner(Networks):
+    """Networks that collect for themselves, with the environments' state between iterations."""
+
+    def __init__(
+        self, envs: gymnasium.vector.VectorEnv, ppo: PPOConfig, hidden_size: int, initial_log_std: float, seed: int
+    ):
+        torch.manual_seed(seed)
+        sizes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]  # type: ignore[index]
+        super().__init__(*sizes, ppo, hidden_size, initial_log_std)
+        self.envs = envs
         self.observation, _ = envs.reset(seed=seed)
         self.is_first = np.ones(envs.num_envs, bool)
         self.carry: Carry = (torch.zeros(2, envs.num_envs, hidden_size), torch.zeros(2, envs.num_envs, hidden_size))
@@ -128,24 +162,24 @@ class Learner:
         steps = rows(observation[:-1]), rows(action), rows(log_prob), rows(is_first)
         return Batch(*steps, hidden, cell, advantage, target)
 
-    def update(self, batch: Batch) -> None:
-        """All epochs and minibatches of one iteration."""
-        for _ in range(self.ppo.epochs):
-            for rows in torch.randperm(len(batch.target)).split(self.ppo.minibatch_trajectories):
-                part = Batch(*(field[rows] for field in batch))
-                _descend(self.policy, self.policy_optimizer, self._policy_loss(part), self.ppo)
-                _descend(self.value, self.value_optimizer, self._value_loss(part), self.ppo)
 
-    def _policy_loss(self, part: Batch) -> torch.Tensor:
-        carry = part.hidden.transpose(0, 1), part.cell.transpose(0, 1)
-        mean = self.policy.sequences(part.observation, carry, part.is_first)
-        distribution = torch.distributions.Normal(mean, self.policy.log_std.exp(), validate_args=False)
-        ratio = (distribution.log_prob(part.action).sum(-1) - part.log_prob).exp()
-        clipped = ratio.clamp(1 - self.ppo.clip, 1 + self.ppo.clip)
-        return -torch.minimum(ratio * part.advantage, clipped * part.advantage).mean()
-
-    def _value_loss(self, part: Batch) -> torch.Tensor:
-        return 0.5 * (self.value(part.observation) - part.target).square().mean()
+def random_batch(rows: int, steps: int, networks: Networks) -> Batch:
+    """Full sequences of noise, each from the beginning of an episode."""
+    policy = networks.policy
+    layers, hidden_size = policy.lstm.num_layers, policy.lstm.hidden_size
+    first = torch.zeros(rows, steps, dtype=torch.bool)
+    first[:, 0] = True
+    action = torch.randn(rows, steps, len(policy.log_std))
+    return Batch(
+        observation=torch.randn(rows, steps, policy.lstm.input_size),
+        action=action,
+        log_prob=torch.distributions.Normal(0.0, 1.0).log_prob(action).sum(-1),
+        is_first=first,
+        hidden=torch.zeros(rows, layers, hidden_size),
+        cell=torch.zeros(rows, layers, hidden_size),
+        advantage=torch.randn(rows, steps),
+        target=torch.randn(rows, steps),
+    )
 
 
 def _keep(carry: Carry, where: torch.Tensor) -> Carry:

@@ -1,17 +1,25 @@
-"""`bench learner`: seconds per PPO update, for the paper's sizes and for the project's defaults."""
+"""`bench learner`: seconds per PPO update, for the paper's sizes and for the project's defaults.
+
+Where torch is installed (the extra `compare`), the same update in torch (`compare_torch`) takes turns with ours at the
+paper's sizes: `nn.LSTM`, the same losses, epochs, minibatches and optimisers, in a process of its own.
+"""
 
 import argparse
+import importlib.util
 import statistics
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 
 import jax
 import numpy as np
 
+from hasrl_jax.bench.compare_peers import PeerProcess
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
-from hasrl_jax.config.schema import Config
+from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 from hasrl_jax.learn.networks import zero_carry
@@ -27,7 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def measure(arguments: argparse.Namespace) -> dict:
     """Both presets, or one."""
     names = ["paper", "default"] if arguments.sizes == "both" else [arguments.sizes]
-    return {"cells": [{"sizes": name, **measure_cell(*sizes(name), arguments.updates)} for name in names]}
+    return {"cells": [{"sizes": name, **measure_size(name, arguments.updates)} for name in names]}
+
+
+def measure_size(name: str, updates: int) -> dict:
+    """One preset; beside torch at the paper's sizes, where the networks of both are the same."""
+    config, rows, steps = sizes(name)
+    wanted = name == "paper" and importlib.util.find_spec("torch") is not None
+    with PeerProcess("torch_update", config, rows, rows * steps) if wanted else nullcontext() as peer:
+        beside = None if peer is None else lambda: peer.iterate(available_cores())[1]
+        return measure_cell(config, rows, steps, updates, beside)
 
 
 def sizes(name: str) -> tuple[Config, int, int]:
@@ -47,19 +64,26 @@ def sizes(name: str) -> tuple[Config, int, int]:
     return replace(config, network=network, ppo=settings), 100, 100
 
 
-def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
-    """Compiles, warms up, and times single updates on the same random trajectories."""
+def measure_cell(
+    config: Config, rows: int, steps: int, updates: int, beside: Callable[[], float] | None = None
+) -> dict:
+    """Compiles, warms up, and times single updates on the same random trajectories.
+
+    `beside` is called after each, and gives the seconds of another system's update.
+    """
     task = make_task(config)
     shapes = task.observation_size, task.action_size, task.mirror
     learner = ppo.init_learner(config, *shapes, jax.random.key(config.seed))
     update = ppo.make_update(config, *shapes, ppo.make_mesh())
     trajectory = random_trajectory(config, rows, steps, *shapes[:2])
-    seconds = []
+    seconds, others = [], []
     for _ in range(updates + 2):
         started = time.perf_counter()
         learner, metrics = update(learner, trajectory)
         jax.block_until_ready((learner, metrics))
         seconds.append(time.perf_counter() - started)
+        if beside:
+            others.append(beside())
     measured = seconds[2:]
     median = statistics.median(measured)
     return {
@@ -70,6 +94,7 @@ def measure_cell(config: Config, rows: int, steps: int, updates: int) -> dict:
         "minibatch_trajectories": config.ppo.minibatch_trajectories,
         "seconds_per_update": median,
         "seconds_fastest": min(measured),
+        "torch_seconds_per_update": statistics.median(others[2:]) if others else None,
         "env_steps_per_second": rows * steps / median,
         "compile_seconds": seconds[0] - median,
         "recompiles": update.trace_count - 1,
@@ -105,7 +130,8 @@ def random_trajectory(config: Config, rows: int, steps: int, observation_size: i
 
 def tables(figures: dict) -> str:
     """One row per preset."""
-    headers = ["sizes", "batch x steps", "hidden", "epochs", "minibatch", "s/update", "best", "compile s", "recompiles"]
+    headers = ["sizes", "batch x steps", "hidden", "epochs", "minibatch", "s/update", "best", "torch s/update"]
+    headers += ["torch / ours", "compile s", "recompiles"]
     rows = [
         [
             cell["sizes"],
@@ -115,6 +141,8 @@ def tables(figures: dict) -> str:
             cell["minibatch_trajectories"],
             cell["seconds_per_update"],
             cell["seconds_fastest"],
+            cell["torch_seconds_per_update"] or "-",
+            cell["torch_seconds_per_update"] / cell["seconds_per_update"] if cell["torch_seconds_per_update"] else "-",
             cell["compile_seconds"],
             cell["recompiles"],
         ]
