@@ -4,23 +4,29 @@
     sb3_make_vec  the same on `gymnasium.make_vec`, that is on this project's engine
     torch         gymnasium's AsyncVectorEnv with a recurrent PPO of our own in torch, `compare_torch`
 
-All of them train on the same task in the same run. A short search first gives each peer its best number of
+With --unilab, UniLab's G1 and our Cassie too, each as a share of the physics limit of its own model (`compare_unilab`).
+
+All but that train on the same task in the same run. A short search first gives each peer its best number of
 environments and threads; then rounds of ours and of the peers alternate, and medians are quoted.
 """
 
 import argparse
 import importlib.util
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import metadata
+from pathlib import Path
 
 import jax
 
+from hasrl_jax.bench import compare_unilab
 from hasrl_jax.bench.collector import PHYSICS, with_physics
 from hasrl_jax.bench.compare_peers import PeerProcess
+from hasrl_jax.bench.physics_limit import PhysicsLimit
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.plan import make_plan
@@ -52,6 +58,13 @@ UNEQUAL = (
     "of every unroll, has one optimiser for both networks and standardises advantages per minibatch. The peers "
     "compute in torch without torch.compile; the info of a step is dropped before it is sent."
 )
+SHARES = (
+    "UniLab {version} has no Cassie, so both are held against bare mj_step of their own models, in a process per core, "
+    "under controls of an untrained policy. Read it as how much each adds to its physics, not as which is faster. Not "
+    "equal: its G1 has 3 physics steps per environment step and ours 10, so an equal cost per environment step weighs "
+    "more on it; its networks are MLPs (512, 256, 128) and ours recurrent; it is made for an accelerator that learns "
+    "and has none here; and it pins another MuJoCo."
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", metavar="N", help="environments to try for the peers")
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, cores}), metavar="N", help="torch, to try")
     parser.add_argument("--rounds", type=int, default=3, help="measured rounds, after one that warms up")
+    parser.add_argument("--unilab", type=Path, metavar="PYTHON", help="of a virtual environment with unilab[mujoco]")
+    parser.add_argument("--unilab-envs", type=int, default=256, metavar="N", help="its environments")
 
 
 def measure(arguments: argparse.Namespace) -> dict:
@@ -80,6 +95,8 @@ def measure(arguments: argparse.Namespace) -> dict:
     for name, smallest in (("rounds", arguments.rounds), ("threads", min(arguments.threads))):
         if smallest < 1:
             raise ConfigError(f"--{name}: got {smallest}; expected at least 1")
+    if arguments.unilab:
+        compare_unilab.version_of(arguments.unilab)
     prepare_jax(config)
     searched = [
         cell
@@ -102,7 +119,21 @@ def measure(arguments: argparse.Namespace) -> dict:
         "search": searched,
         "cells": cells,
         "ratios": [ratios(peer, cells) for peer in arguments.peers],
+        "shares": beside_unilab(arguments, config, cells[0]) if arguments.unilab else [],
     }
+
+
+def beside_unilab(arguments: argparse.Namespace, config: Config, ours: dict) -> list[dict]:
+    """Ours and UniLab's environment steps/s as shares of the physics limit of each one's own model."""
+    plan = make_plan(config)
+    with PhysicsLimit(config, plan.num_workers, plan.steps_per_worker) as limit:
+        bound = statistics.median(limit.round()[0] for _ in range(arguments.rounds))
+    own = compare_unilab.shares(ours["collector_per_second"], ours["env_steps_per_second"], bound)
+    with tempfile.TemporaryDirectory() as folder:
+        theirs = compare_unilab.measure(
+            arguments.unilab, Path(folder), arguments.unilab_envs, 2 * arguments.rounds, available_cores()
+        )
+    return [{"name": f"ours, {config.task}", "num_envs": ours["num_envs"], **own}, theirs]
 
 
 def make_config(arguments: argparse.Namespace) -> Config:
@@ -275,4 +306,10 @@ def tables(figures: dict) -> str:
         parts.append(format_table(["tried", "envs", "threads", "env steps/s", "collector alone"], tried))
         versions = ", ".join(f"{name} {version}" for name, version in figures["versions"].items())
         parts += [EQUAL, UNEQUAL, versions]
+    if figures["shares"]:
+        headers = ["share of its own limit", "envs", "limit", "collecting", "share", "end to end", "share"]
+        names = ("name", "num_envs", "limit_env_steps_per_second", "collector_per_second", "collecting_share")
+        names += ("env_steps_per_second", "end_to_end_share")
+        rows = [[cell[name] for name in names] for cell in figures["shares"]]
+        parts += [format_table(headers, rows), SHARES.format(version=figures["shares"][1]["version"])]
     return "\n\n".join(parts)

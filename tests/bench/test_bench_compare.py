@@ -110,7 +110,7 @@ def test_the_batch_tells_sb3_how_episodes_ended() -> None:
 
     def make() -> gymnasium.vector.VectorEnv:
         config = from_dict(yaml.safe_load(TINY))
-        name = "hasrl_jax.envs.gymnasium:hasrl_jax/CartPole-v0"
+        name = "hasrl_jax.envs.gymnasium:hasrl_jax/CartpoleHiddenVelocity-v0"
         return gymnasium.make_vec(name, 3, config=config, autoreset_mode=AutoresetMode.SAME_STEP)
 
     ours, theirs = BatchVecEnv(make()), make()

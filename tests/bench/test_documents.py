@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 CELL = {
     **{"sizes": "paper", "trajectories": 100, "steps": 100, "hidden": 256, "epochs": 10},
     **{"minibatch_trajectories": 100, "seconds_per_update": 2.345, "seconds_fastest": 2.3},
-    **{"compile_seconds": 4.0, "recompiles": 0},
+    **{"torch_seconds_per_update": 4.69, "compile_seconds": 4.0, "recompiles": 0},
 }
 REPORT = {
     **{"bench": "learner", "command": "python -m hasrl_jax.bench learner", "date": "2026-01-02T03:04:05"},
@@ -36,7 +36,7 @@ def test_a_marked_block_is_written_and_the_rest_stays(tmp_path: Path) -> None:
     assert text.endswith("<!-- end -->\nafter\n")
     assert "old" not in text and "Measured on 2026-01-02: 2 cores (a CPU), load 0.0" in text
     row = next(line for line in text.splitlines() if line.startswith("| paper"))
-    assert row.replace(" ", "").split("|")[1:8] == ["paper", "100x100", "256", "10", "100", "2.35", "2.3"]
+    assert row.replace(" ", "").split("|")[1:10] == ["paper", "100x100", "256", "10", "100", "2.35", "2.3", "4.69", "2"]
     assert refresh(tmp_path, tmp_path) == []
 
 
