@@ -22,7 +22,7 @@ mutation:  ## which changes of the mathematics no test notices; hours
 	nice -n 19 $(BIN)/python tests/mutation.py
 
 bench:  ## timed figures on an idle machine, and the tables of docs/ from them
-	for name in collector scaling learner mjx parity; do \
+	for name in physics collector scaling learner mjx parity; do \
 		$(BIN)/python -m hasrl_jax.bench $$name --json benchmarks/results/$$name.json || exit 1; done
 	$(BIN)/python -m hasrl_jax.bench docs
 
