@@ -9,8 +9,9 @@ import importlib.util
 import statistics
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -42,9 +43,17 @@ def measure_size(name: str, updates: int) -> dict:
     """One preset; beside torch at the paper's sizes, where the networks of both are the same."""
     config, rows, steps = sizes(name)
     wanted = name == "paper" and importlib.util.find_spec("torch") is not None
-    with PeerProcess("torch_update", config, rows, rows * steps) if wanted else nullcontext() as peer:
-        beside = None if peer is None else lambda: peer.iterate(available_cores())[1]
+    with ExitStack() as stack:
+        beside: Callable[[], float] | None = None
+        if wanted:
+            peer = stack.enter_context(PeerProcess("torch_update", config, rows, rows * steps))
+            beside = partial(torch_seconds, peer)
         return measure_cell(config, rows, steps, updates, beside)
+
+
+def torch_seconds(peer: PeerProcess) -> float:
+    """Of one update of the peer on all cores."""
+    return peer.iterate(available_cores())[1]
 
 
 def sizes(name: str) -> tuple[Config, int, int]:

@@ -125,9 +125,17 @@ def own_models(task: Task, num_envs: int) -> Step:
         for env, model in enumerate(models):
             write_fields(model, moment.state.model_fields, env)
         control = np.repeat(moment.control[:, None], steps, axis=1)
-        outputs = {"state": states, "sensordata": sensors}
         started = time.thread_time()
-        engine.rollout(models, [data], moment.state.physics, control, skip_checks=True, nstep=steps, **outputs)
+        engine.rollout(
+            models,
+            [data],
+            moment.state.physics,
+            control,
+            skip_checks=True,
+            nstep=steps,
+            state=states,
+            sensordata=sensors,
+        )
         return states[:, -1].copy(), time.thread_time() - started
 
     return step

@@ -11,7 +11,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -147,6 +147,9 @@ def check_arguments(arguments: argparse.Namespace, configs: dict[int, Config]) -
 @contextmanager
 def on_cores(number: int) -> Iterator[None]:
     """This thread, and the processes that it starts, on the first `number` cores that it may use."""
+    if number >= available_cores():
+        yield
+        return
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[:number])
     try:
@@ -186,7 +189,7 @@ def measure_round(place: Place, learner_state: ppo.LearnerState, iteration: int)
     workers' last replies come in. Ray's buffers are gone by then: its merging is only in its environment steps/s.
     """
     pool = place.pool
-    with on_cores(place.cores) if place.cores < available_cores() else nullcontext():
+    with on_cores(place.cores):
         started = time.perf_counter()
         parameters = ppo.export_parameters(learner_state)
         exported = time.perf_counter()
