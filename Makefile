@@ -25,7 +25,7 @@ soak:  ## long runs: memory, descriptors and threads stay where they are; minute
 	$(BIN)/python tests/soak.py
 
 bench:  ## timed figures on an idle machine, and the tables of docs/ from them
-	for name in collector scaling learner mjx parity; do \
+	for name in physics collector scaling learner mjx parity; do \
 		$(BIN)/python -m hasrl_jax.bench $$name --json benchmarks/results/$$name.json || exit 1; done
 	$(BIN)/python -m hasrl_jax.bench docs
 

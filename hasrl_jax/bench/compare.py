@@ -1,25 +1,32 @@
 """`bench compare`: this project against two usual ways to train a recurrent policy on a gymnasium environment.
 
-    sb3    stable-baselines3-contrib: RecurrentPPO on SubprocVecEnv
-    torch  gymnasium's AsyncVectorEnv with a recurrent PPO of our own in torch, `compare_torch`
+    sb3           stable-baselines3-contrib: RecurrentPPO on SubprocVecEnv
+    sb3_make_vec  the same on `gymnasium.make_vec`, that is on this project's engine
+    torch         gymnasium's AsyncVectorEnv with a recurrent PPO of our own in torch, `compare_torch`
 
-All of them train on the same task in the same run. A short search first gives each peer its best number of
+With --unilab, UniLab's G1 and our Cassie too, each as a share of the physics limit of its own model (`compare_unilab`).
+
+All but that train on the same task in the same run. A short search first gives each peer its best number of
 environments and threads; then rounds of ours and of the peers alternate, and medians are quoted.
 """
 
 import argparse
 import importlib.util
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import metadata
+from pathlib import Path
 
 import jax
 
+from hasrl_jax.bench import compare_unilab
 from hasrl_jax.bench.collector import PHYSICS, with_physics
 from hasrl_jax.bench.compare_peers import PeerProcess
+from hasrl_jax.bench.physics_limit import PhysicsLimit
 from hasrl_jax.bench.report import format_table
 from hasrl_jax.collect.backends import make_collector
 from hasrl_jax.collect.plan import make_plan
@@ -34,10 +41,9 @@ from hasrl_jax.learn.networks import make_networks
 from hasrl_jax.train.devices import prepare_jax
 
 # peer -> the distributions that it needs, by the module that each provides
-NEEDS = {
-    "sb3": {"torch": "torch", "stable_baselines3": "stable-baselines3", "sb3_contrib": "sb3-contrib"},
-    "torch": {"torch": "torch"},
-}
+SB3 = {"torch": "torch", "stable_baselines3": "stable-baselines3", "sb3_contrib": "sb3-contrib"}
+NEEDS = {"sb3": SB3, "sb3_make_vec": SB3, "torch": {"torch": "torch"}}
+IN_ONE_PROCESS = {"sb3_make_vec": (16, 32, 64)}  # peers that step all environments themselves -> numbers to try
 CLEARLY = 1.1  # less is the noise of a short search
 SINGLE_STEPS = 2000  # of the lone environment, per round
 EQUAL = (
@@ -45,11 +51,19 @@ EQUAL = (
     "networks, GAE, Adam, no observation normalisation, no mirror, no early stop by KL, processes on one thread."
 )
 UNEQUAL = (
-    "Not equal: ours steps many environments in each process, the peers one, because their vector environments do; "
+    "Not equal: ours steps many environments in each process, the peers one, because their vector environments do "
+    "(but `sb3_make_vec`, which steps all of them on our engine, in one process, between its inferences); "
     "our environment costs more CPU time alone than in a batch (row `single`, one process without a policy), and "
     "`torch` and `sb3` pay that. Ours has a tanh after each LSTM layer. sb3 cuts its minibatches at episodes instead "
     "of every unroll, has one optimiser for both networks and standardises advantages per minibatch. The peers "
     "compute in torch without torch.compile; the info of a step is dropped before it is sent."
+)
+SHARES = (
+    "UniLab {version} has no Cassie, so both are held against bare mj_step of their own models, in a process per core, "
+    "under controls of an untrained policy. Read it as how much each adds to its physics, not as which is faster. Not "
+    "equal: its G1 has 3 physics steps per environment step and ours 10, so an equal cost per environment step weighs "
+    "more on it; its networks are MLPs (512, 256, 128) and ours recurrent; it is made for an accelerator that learns "
+    "and has none here; and it pins another MuJoCo."
 )
 
 
@@ -64,6 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", metavar="N", help="environments to try for the peers")
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, cores}), metavar="N", help="torch, to try")
     parser.add_argument("--rounds", type=int, default=3, help="measured rounds, after one that warms up")
+    parser.add_argument("--unilab", type=Path, metavar="PYTHON", help="of a virtual environment with unilab[mujoco]")
+    parser.add_argument("--unilab-envs", type=int, default=256, metavar="N", help="its environments")
 
 
 def measure(arguments: argparse.Namespace) -> dict:
@@ -79,8 +95,14 @@ def measure(arguments: argparse.Namespace) -> dict:
     for name, smallest in (("rounds", arguments.rounds), ("threads", min(arguments.threads))):
         if smallest < 1:
             raise ConfigError(f"--{name}: got {smallest}; expected at least 1")
+    if arguments.unilab:
+        compare_unilab.version_of(arguments.unilab)
     prepare_jax(config)
-    searched = [cell for peer in arguments.peers for cell in search(peer, config, choices, arguments.threads)]
+    searched = [
+        cell
+        for peer in arguments.peers
+        for cell in search(peer, config, in_one_process(peer, choices, config), arguments.threads)
+    ]
     finalists = [cell for peer in arguments.peers for cell in best([c for c in searched if c["name"] == peer])]
     cells = measure_rounds(config, finalists, arguments.rounds)
     return {
@@ -97,7 +119,21 @@ def measure(arguments: argparse.Namespace) -> dict:
         "search": searched,
         "cells": cells,
         "ratios": [ratios(peer, cells) for peer in arguments.peers],
+        "shares": beside_unilab(arguments, config, cells[0]) if arguments.unilab else [],
     }
+
+
+def beside_unilab(arguments: argparse.Namespace, config: Config, ours: dict) -> list[dict]:
+    """Ours and UniLab's environment steps/s as shares of the physics limit of each one's own model."""
+    plan = make_plan(config)
+    with PhysicsLimit(config, plan.num_workers, plan.steps_per_worker) as limit:
+        bound = statistics.median(limit.round()[0] for _ in range(arguments.rounds))
+    own = compare_unilab.shares(ours["collector_per_second"], ours["env_steps_per_second"], bound)
+    with tempfile.TemporaryDirectory() as folder:
+        theirs = compare_unilab.measure(
+            arguments.unilab, Path(folder), arguments.unilab_envs, 2 * arguments.rounds, available_cores()
+        )
+    return [{"name": f"ours, {config.task}", "num_envs": ours["num_envs"], **own}, theirs]
 
 
 def make_config(arguments: argparse.Namespace) -> Config:
@@ -127,6 +163,12 @@ def peer_envs(arguments: argparse.Namespace, config: Config, env_steps: int) -> 
         refused = next(number for number in asked if number not in choices)
         raise ConfigError(f"--num-envs: got {refused}; expected a divisor of {sequences[0]} and {sequences[1]}")
     return choices or [1]
+
+
+def in_one_process(peer: str, choices: list[int], config: Config) -> list[int]:
+    """`choices`, or for a peer that steps all environments in one process those of its own that divide a minibatch."""
+    own = [number for number in IN_ONE_PROCESS.get(peer, ()) if config.ppo.minibatch_trajectories % number == 0]
+    return own or choices
 
 
 def require_packages(peers: list[str], option: str = "--peers") -> None:
@@ -187,7 +229,8 @@ def measure_rounds(config: Config, finalists: list[dict], rounds: int) -> list[d
             def peer_iterate(peer: PeerProcess = peer, threads: int = threads) -> dict[str, float]:
                 return speeds(plan.env_steps, *peer.iterate(threads))
 
-            contestants.append((cell["name"], num_envs, num_envs, threads, peer.parameters, peer_iterate))
+            processes = 1 if cell["name"] in IN_ONE_PROCESS else num_envs
+            contestants.append((cell["name"], num_envs, processes, threads, peer.parameters, peer_iterate))
         measured = [[contestant[-1]() for contestant in contestants] for _ in range(rounds + 1)]
     labels = ("name", "num_envs", "processes", "threads", "parameters")
     cells = []
@@ -263,4 +306,10 @@ def tables(figures: dict) -> str:
         parts.append(format_table(["tried", "envs", "threads", "env steps/s", "collector alone"], tried))
         versions = ", ".join(f"{name} {version}" for name, version in figures["versions"].items())
         parts += [EQUAL, UNEQUAL, versions]
+    if figures["shares"]:
+        headers = ["share of its own limit", "envs", "limit", "collecting", "share", "end to end", "share"]
+        names = ["name", "num_envs", "limit_env_steps_per_second", "collector_per_second", "collecting_share"]
+        names += ["env_steps_per_second", "end_to_end_share"]
+        rows = [[cell[name] for name in names] for cell in figures["shares"]]
+        parts += [format_table(headers, rows), SHARES.format(version=figures["shares"][1]["version"])]
     return "\n\n".join(parts)

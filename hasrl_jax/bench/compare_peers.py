@@ -1,8 +1,8 @@
 """The other systems of `bench compare`, each in a process of its own that holds no JAX.
 
 `python -m hasrl_jax.bench.compare_peers CONNECTION` is such a process. It starts one sub-process per environment, as
-the vector environments of gymnasium and stable-baselines3 do, runs one iteration whenever it is asked, and ends with
-everything it started when the connection closes.
+the vector environments of gymnasium and stable-baselines3 do (`sb3_make_vec` steps all of them itself), runs one
+iteration whenever it is asked, and ends with everything it started when the connection closes.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from hasrl_jax.collect.worker import die_with_parent, reply
 from hasrl_jax.config.convert import from_dict, to_dict
@@ -120,9 +121,36 @@ def make_env(config: Config, parent: int) -> gymnasium.Env:
 @contextlib.contextmanager
 def sb3(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int, Iterate]]:
     """RecurrentPPO of sb3-contrib on a SubprocVecEnv."""
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    # Forked, so that a sub-process need not import torch anew; there are no threads yet that a fork could lose.
+    envs = SubprocVecEnv([functools.partial(make_env, config, os.getpid())] * num_envs, start_method="fork")
+    try:
+        yield recurrent_ppo(envs, config, env_steps)
+    finally:
+        envs.close()
+
+
+@contextlib.contextmanager
+def sb3_make_vec(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int, Iterate]]:
+    """RecurrentPPO of sb3-contrib on `gymnasium.make_vec`: all environments in this process, in one call."""
+    from hasrl_jax.bench.compare_sb3 import BatchVecEnv
+
+    name = next(name for name, task in ENVIRONMENTS.items() if task == config.task)
+    mode = AutoresetMode.SAME_STEP  # as stable-baselines3 defines a step
+    envs = BatchVecEnv(
+        gymnasium.make_vec(f"hasrl_jax.envs.gymnasium:{name}", num_envs, config=config, autoreset_mode=mode)
+    )
+    try:
+        yield recurrent_ppo(envs, config, env_steps)
+    finally:
+        envs.close()
+
+
+def recurrent_ppo(envs: Any, config: Config, env_steps: int) -> tuple[int, Iterate]:
+    """(number of parameters, one iteration) of sb3-contrib's RecurrentPPO on a vector environment of sb3's kind."""
     from sb3_contrib import RecurrentPPO
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.vec_env import SubprocVecEnv
 
     class Clock(BaseCallback):
         collected = 0.0
@@ -134,47 +162,42 @@ def sb3(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int, It
             self.collected = time.perf_counter()
 
     ppo, hidden = config.ppo, config.network.hidden_size
-    # Forked, so that a sub-process need not import torch anew; there are no threads yet that a fork could lose.
-    envs = SubprocVecEnv([functools.partial(make_env, config, os.getpid())] * num_envs, start_method="fork")
-    try:
-        model = RecurrentPPO(
-            "MlpLstmPolicy",
-            envs,
-            learning_rate=ppo.policy_learning_rate,
-            n_steps=env_steps // num_envs,
-            batch_size=ppo.minibatch_trajectories * config.collect.unroll_length,
-            n_epochs=ppo.epochs,
-            gamma=ppo.discount,
-            gae_lambda=ppo.gae_lambda,
-            clip_range=ppo.clip,
-            ent_coef=0.0,
-            max_grad_norm=ppo.max_gradient_norm,
-            policy_kwargs={
-                "lstm_hidden_size": hidden,
-                "n_lstm_layers": 2,
-                "enable_critic_lstm": False,  # its place takes a linear layer, the first of the three of the value
-                "net_arch": {"pi": [], "vf": [hidden]},
-                "log_std_init": config.network.initial_log_std,
-            },
-            seed=config.seed,
-            device="cpu",
-        )
-        clock = Clock()
+    model = RecurrentPPO(
+        "MlpLstmPolicy",
+        envs,
+        learning_rate=ppo.policy_learning_rate,
+        n_steps=env_steps // envs.num_envs,
+        batch_size=ppo.minibatch_trajectories * config.collect.unroll_length,
+        n_epochs=ppo.epochs,
+        gamma=ppo.discount,
+        gae_lambda=ppo.gae_lambda,
+        clip_range=ppo.clip,
+        ent_coef=0.0,
+        max_grad_norm=ppo.max_gradient_norm,
+        policy_kwargs={
+            "lstm_hidden_size": hidden,
+            "n_lstm_layers": 2,
+            "enable_critic_lstm": False,  # its place takes a linear layer, the first of the three of the value
+            "net_arch": {"pi": [], "vf": [hidden]},
+            "log_std_init": config.network.initial_log_std,
+        },
+        seed=config.seed,
+        device="cpu",
+    )
+    clock = Clock()
 
-        def iterate() -> tuple[float, float]:
-            started = time.perf_counter()
-            model.learn(env_steps, callback=clock, reset_num_timesteps=False)
-            return clock.collected - started, time.perf_counter() - started
+    def iterate() -> tuple[float, float]:
+        started = time.perf_counter()
+        model.learn(env_steps, callback=clock, reset_num_timesteps=False)
+        return clock.collected - started, time.perf_counter() - started
 
-        yield sum(parameter.numel() for parameter in model.policy.parameters()), iterate
-    finally:
-        envs.close()
+    return sum(parameter.numel() for parameter in model.policy.parameters()), iterate
 
 
 @contextlib.contextmanager
 def torch_lstm(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int, Iterate]]:
     """The PPO of `compare_torch` on gymnasium's AsyncVectorEnv."""
-    from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+    from gymnasium.vector import AsyncVectorEnv
 
     constructors = [functools.partial(make_env, config, os.getpid())] * num_envs
     envs = AsyncVectorEnv(constructors, autoreset_mode=AutoresetMode.SAME_STEP)  # no step is spent on a reset
@@ -234,7 +257,7 @@ def single(config: Config, num_envs: int, env_steps: int) -> Iterator[tuple[int,
     env.close()
 
 
-PEERS = {"sb3": sb3, "torch": torch_lstm, "torch_update": torch_update, "single": single}
+PEERS = {"sb3": sb3, "sb3_make_vec": sb3_make_vec, "torch": torch_lstm, "torch_update": torch_update, "single": single}
 
 
 def serve(connection: Connection) -> None:

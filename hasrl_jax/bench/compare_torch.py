@@ -172,23 +172,19 @@ class Trainer(Learner):
 
 def noise(learner: Learner, rows: int, steps: int, hidden_size: int) -> Batch:
     """`rows` whole sequences of `steps` random steps, to time an update with."""
-    (observation_size, action_size), shape = (
-        (learner.policy.lstm.input_size, len(learner.policy.log_std)),
-        (rows, steps),
-    )
+    policy, shape = learner.policy, (rows, steps)
     is_first = torch.zeros(shape, dtype=torch.bool)
     is_first[:, 0] = True
-    action = torch.randn(*shape, action_size)
-    log_prob = torch.distributions.Normal(0.0, 1.0).log_prob(action).sum(-1)
-    carry = torch.zeros(2, rows, 2, hidden_size)
+    action = torch.randn(*shape, len(policy.log_std))
     return Batch(
-        torch.randn(*shape, observation_size),
-        action,
-        log_prob,
-        is_first,
-        *carry,
-        torch.randn(shape),
-        torch.randn(shape),
+        observation=torch.randn(*shape, policy.lstm.input_size),
+        action=action,
+        log_prob=torch.distributions.Normal(0.0, 1.0).log_prob(action).sum(-1),
+        is_first=is_first,
+        hidden=torch.zeros(rows, 2, hidden_size),
+        cell=torch.zeros(rows, 2, hidden_size),
+        advantage=torch.randn(shape),
+        target=torch.randn(shape),
     )
 
 

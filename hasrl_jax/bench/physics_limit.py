@@ -114,14 +114,19 @@ def replay(stretches: list[Stretch], steps_per_env_step: int) -> None:
 
 
 def _fields_of(model_fields: dict[str, np.ndarray], env: int) -> dict[str, np.ndarray]:
-    return {name: values[env].copy() for name, values in model_fields.items()}
+    return {name: values[env : env + 1].copy() for name, values in model_fields.items()}
 
 
 def _with_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray]) -> mujoco.MjModel:
     model = model.__copy__()
-    for name, value in fields.items():
-        if name == "timestep":
-            model.opt.timestep = value
-        else:
-            getattr(model, name)[:] = value
+    write_fields(model, fields, 0)
     return model
+
+
+def write_fields(model: mujoco.MjModel, fields: dict[str, np.ndarray], row: int) -> None:
+    """The fields of one robot, row `row` of each [E, ...], into its model."""
+    for name, values in fields.items():
+        if name == "timestep":
+            model.opt.timestep = values[row]
+        else:
+            getattr(model, name)[:] = values[row]

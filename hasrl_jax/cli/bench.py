@@ -17,6 +17,7 @@ from hasrl_jax.cli.parsing import run as run_command
 BENCHES = {
     "collector": ("hasrl_jax.bench.collector", "env steps/s of the CPU pool, and its share of the physics limit"),
     "scaling": ("hasrl_jax.bench.scaling", "env steps/s by number of workers, and what each worker costs"),
+    "physics": ("hasrl_jax.bench.physics", "where the time of a physics step goes, and other ways to step"),
     "learner": ("hasrl_jax.bench.learner", "seconds per PPO update, compile time and recompiles"),
     "compare": ("hasrl_jax.bench.compare", "ours against stable-baselines3 and a torch PPO on gymnasium"),
     "mjx": ("hasrl_jax.bench.mjx", "physics and environment steps/s of MJX by number of environments"),

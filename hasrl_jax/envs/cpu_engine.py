@@ -4,14 +4,14 @@ Every number that describes the environments is an array in `EnvState`, so savin
 is copying arrays. Randomness comes in as a NumPy generator; the environments hold none.
 """
 
-import copy
 import time
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from mujoco import rollout
+from mujoco.batch import Batch
 
+from hasrl_jax.envs.model import without_islands
 from hasrl_jax.envs.task import Reading, Reset, Task
 from hasrl_jax.errors import DivergenceError
 from hasrl_jax.types import Array
@@ -19,12 +19,13 @@ from hasrl_jax.types import Array
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
 FORCE = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value
+SPLIT_FROM = 8  # environments from which sensors left out save more than the second call that this takes
 
 
 class EnvState(NamedTuple):
     """The complete state of E environments."""
 
-    physics: np.ndarray  # [E, nstate] float64: time, qpos, qvel (mjSTATE_FULLPHYSICS)
+    physics: np.ndarray  # [E, nstate] float64: time, qpos, qvel, act (mjSTATE_FULLPHYSICS)
     task: Any  # the task's NamedTuple of arrays [E, ...]
     model_fields: dict[str, np.ndarray]  # randomised MjModel fields [E, ...]
     observation: np.ndarray  # [E, O] the observation that the policy sees next
@@ -46,7 +47,7 @@ class StepResult(NamedTuple):
 
 
 class CpuEnvs:
-    """E copies of a task, each with a model of its own if episodes randomise it.
+    """E copies of a task, each with fields of the model to itself if episodes randomise them.
 
     Fresh episodes are prepared E at a time, because drawing many costs little more than drawing one. Those that are
     left never outlive the generator they were drawn from, so results depend on states and generators alone.
@@ -68,19 +69,22 @@ class CpuEnvs:
         self._timestep = task.model.opt.timestep
         self._timed = timed
         self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
-        self._models = [task.model] * num_envs
         self._prepared: Reset | None = None  # E fresh episodes
         self._taken = 0  # of the prepared episodes
         self._source: Any = None  # the generator that drew them
-        self._data = mujoco.MjData(task.model)
-        self._rollout = rollout.Rollout(nthread=0)  # on the calling thread: one core per worker
+        self._batch = Batch(without_islands(task.model), num_envs, nthread=1)  # on the calling thread: a core a worker
+        self._fields: dict[str, np.ndarray] = {}  # randomised field -> its values [E, ...] in the batch
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
-        self._states = np.empty((num_envs, task.steps_per_env_step, size))
-        self._sensordata = np.empty((num_envs, task.steps_per_env_step, task.model.nsensordata))
+        self._physics = self._batch.state[:, :size]
+        self._warm_start = self._batch.bind("qacc_warmstart")
+        self._late = [task.model.sensor(name).id for name in task.end_sensors]
+        steps = task.steps_per_env_step
+        split = bool(self._late) and steps > 1 and num_envs >= SPLIT_FROM
+        self._parts = (steps - 1, 1) if split else (steps,)  # physics steps of each call
+        self._stages = self._batch.expand("sensor_needstage") if split else None  # [E, sensors]
+        self._records: list[dict[Any, np.ndarray]] = [{} for _ in self._parts]
         self._force = task.force if task.disturbed or pushable else None
-        inputs = task.model.nu + (task.model.nv if self._force else 0)
         self._control_spec = CONTROL | FORCE if self._force else CONTROL
-        self._controls = np.empty((num_envs, task.steps_per_env_step, inputs))
 
     def reset(self, rng: np.random.Generator) -> EnvState:
         """Fresh episodes in all environments."""
@@ -98,12 +102,9 @@ class CpuEnvs:
         return state
 
     def restore(self, state: EnvState) -> None:
-        """Writes the randomised fields of `state` into the models, as `step` expects to find them."""
+        """Writes the randomised fields of `state` into the batch, as `step` expects to find them."""
         self._prepared = None
-        if state.model_fields and self._models[0] is self.task.model:  # one model for all would stay in the cache
-            self._models = [copy.copy(self.task.model) for _ in range(self.num_envs)]
-        for env in range(self.num_envs):
-            self._write_fields(env, state.model_fields, env)
+        self._write_fields(slice(None), state.model_fields, slice(None))
 
     def step(self, state: EnvState, action: np.ndarray, rng: np.random.Generator) -> tuple[EnvState, StepResult]:
         """One environment step; environments whose episode ended are reset.
@@ -169,8 +170,7 @@ class CpuEnvs:
             return new
 
         if fields:
-            for env in envs:
-                self._write_fields(env, before.model_fields, env)
+            self._write_fields(envs, before.model_fields, envs)
         return EnvState(
             physics=put(after.physics, before.physics),
             task=type(after.task)(*map(put, after.task, before.task)),
@@ -187,40 +187,45 @@ class CpuEnvs:
         Returns:
           The physics state, what the task reads of it, and which simulations diverged, [E] bool.
         """
-        task, model, timestep = self.task, self.task.model, self._physics_step_s(state)
+        task, model = self.task, self.task.model
         if task.pace:
-            for own, seconds in zip(self._models, np.broadcast_to(timestep, self.num_envs), strict=True):
-                own.opt.timestep = seconds
-        self._controls[:, :, : model.nu] = control
+            self._field("timestep")[:] = self._physics_step_s(state)
         if self._force:
-            self._controls[:, :, model.nu :] = self._force(state.task, np)[:, None]
+            applied = np.repeat(self._force(state.task, np)[:, None], control.shape[1], axis=1)
+            control = np.concatenate([control, applied], axis=2)
+        self._physics[:] = state.physics
+        self._warm_start[:] = 0.0  # what is simulated depends on the state alone
         cpu = time.thread_time() if self._timed else 0.0  # MuJoCo runs on this thread
-        self._rollout.rollout(
-            self._models,
-            [self._data],
-            state.physics,
-            self._controls,
-            control_spec=self._control_spec,
-            skip_checks=True,
-            nstep=task.steps_per_env_step,
-            state=self._states,
-            sensordata=self._sensordata,
-        )
+        self._run(control)
         if self._timed:
             self.physics_seconds += time.thread_time() - cpu
-        end, sensordata = self._states[:, -1].copy(), self._sensordata[:, -1].copy()
-        # MuJoCo resets a simulation that went bad to a finite state, in which time starts at zero again.
-        elapsed = end[:, 0] - state.physics[:, 0]
-        on_time = np.abs(elapsed - timestep * task.steps_per_env_step) < 0.5 * timestep
+        end, sensordata = self._physics.copy(), self._records[-1]["sensordata"][:, -1].copy()
+        # MuJoCo resets a simulation that went bad to a finite state, and counts it.
+        warnings = self._batch.warning[:, :, 1]
+        warned = warnings.any(axis=1)
+        if warned.any():
+            warnings[:] = 0
         # A sum is finite where all its numbers are.
-        diverged = ~(on_time & np.isfinite(end.sum(axis=1) + sensordata.sum(axis=1)))
+        diverged = warned | ~np.isfinite(end.sum(axis=1) + sensordata.sum(axis=1))
+        features = [task.physics_features(record["sensordata"], np).sum(axis=1) for record in self._records]
         reading = Reading(
             qpos=end[:, 1 : 1 + model.nq],
             qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
             sensordata=sensordata,
-            averages=task.physics_features(self._sensordata, np).sum(axis=1) / task.steps_per_env_step,
+            averages=sum(features) / task.steps_per_env_step,
         )
         return end, reading, diverged
+
+    def _run(self, control: np.ndarray) -> None:
+        """All physics steps under `control`, [E, S or 1, inputs]; sensors that only the last one needs wait for it."""
+        first = 0
+        for steps, record in zip(self._parts, self._records, strict=True):
+            if self._stages is not None:
+                late = self.task.model.sensor_needstage[self._late] if first else mujoco.mjtStage.mjSTAGE_NONE.value
+                self._stages[:, self._late] = late
+            part = control if control.shape[1] == 1 else control[:, first : first + steps]
+            record |= self._batch.rollout(steps, part, self._control_spec, ["sensordata"], out=record)
+            first += steps
 
     def _reset_some(self, state: EnvState, envs: np.ndarray, rng: np.random.Generator) -> EnvState:
         """`state` with fresh episodes in the environments numbered `envs`; takes over its arrays where it owns them."""
@@ -239,8 +244,7 @@ class CpuEnvs:
         physics[envs] = _physics(fresh, self.task.model.na)[rows]
         # These arrays were made for this state alone.
         state.is_first[envs], state.episode_step[envs], state.episode_return[envs] = True, 0, 0.0
-        for row, env in zip(range(rows.start, rows.stop), envs, strict=True):
-            self._write_fields(env, fresh.model_fields, row)
+        self._write_fields(envs, fresh.model_fields, rows)
         return state._replace(
             physics=physics,
             task=type(state.task)(*map(put, state.task, fresh.state)),
@@ -248,14 +252,16 @@ class CpuEnvs:
             observation=put(state.observation, fresh.observation),
         )
 
-    def _write_fields(self, env: int, fields: dict[str, np.ndarray], row: int) -> None:
-        """Row `row` of the randomised fields into the model of environment `env`."""
-        model = self._models[env]
+    def _write_fields(self, envs: np.ndarray | slice, fields: dict[str, np.ndarray], rows: np.ndarray | slice) -> None:
+        """Rows `rows` of the randomised fields into those of the environments `envs`."""
         for name, values in fields.items():
-            if name == "timestep":
-                model.opt.timestep = values[row]
-            else:
-                getattr(model, name)[:] = values[row]
+            self._field(name)[envs] = values[rows]
+
+    def _field(self, name: str) -> np.ndarray:
+        """Field `name` of the model, [E, ...], with a value of its own in each environment from now on."""
+        if name not in self._fields:
+            self._fields[name] = self._batch.expand("opt.timestep" if name == "timestep" else name)
+        return self._fields[name]
 
 
 def _physics(fresh: Reset, activations: int) -> np.ndarray:

@@ -77,12 +77,14 @@ class Task:
     step_uniforms: int = 0  # uniform [0, 1) numbers that `step` consumes
     # (state, xp) -> the action [..., A] that still acts at the beginning of an environment step, and for how long, s
     delay: Callable[[Any, Any], tuple[Array, Array]] | None = None
-    # (state, xp) -> factor on the physics step of the coming environment step [...]; needs models of their own
+    # (state, xp) -> factor on the physics step of the coming environment step [...]
     pace: Callable[[Any, Any], Array] | None = None
     measures: tuple[str, ...] = ()
     mirror: Mirror | None = None
     # (sensordata [..., ns], xp) -> [..., F]; nothing is averaged over physics steps by default
     physics_features: Callable[[Array, Any], Array] = lambda sensordata, xp: sensordata[..., :0]
+    # sensors of which only the last physics step is read; `physics_features` finds nothing valid in their place
+    end_sensors: tuple[str, ...] = ()
     force: Callable[[Any, Any], Array] | None = None  # (state, xp) -> force from outside on each qvel [..., nv]
     # puts ground that changes by episode into a copy of the model
     ground: Callable[[mujoco.MjSpec], None] | None = None

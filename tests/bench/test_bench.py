@@ -148,9 +148,29 @@ def test_who_stands_still_or_falls_does_not_walk() -> None:
         assert not walking.is_walking([good, good | bad], 0.9, 0.2)
 
 
+def test_physics_is_itemised_and_every_way_is_held_against_plain_mujoco(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    file = tmp_path / "physics.json"
+    assert main(["physics", "--num-envs", "9", "--rounds", "1", "--json", str(file)]) == 0
+    assert "solving constraints" in capsys.readouterr().out
+    written = json.loads(file.read_text())["figures"]
+    parts = written["parts"]
+    assert all(us >= 0 for us in parts["us"].values())
+    assert sum(parts["us"].values()) >= parts["us_per_physics_step"] * 0.999
+    assert parts["counts"]["constraint rows"] > 12  # two loops a leg, three rows each
+    deviation = {cell["way"]: cell["deviation"] for cell in written["cells"]}
+    same = ("the engine", "all sensors in every physics step", "islands", "no midphase", "no sensors (a bound)")
+    assert [deviation[name] for name in same] == [0.0] * len(same)
+    assert 0 < deviation["sparse Jacobian"] < 1e-9
+    assert deviation["no contacts (a bound)"] > 1e-3
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
+        (["physics", "--num-envs", "0"], "--num-envs"),
+        (["physics", "--rounds", "0"], "--rounds"),
         (["schedules", "--seeds", "0"], "--seeds"),
         (["walking", "--every", "0"], "--every"),
         (["walking", "--config", "cartpole"], "expected one that walks"),

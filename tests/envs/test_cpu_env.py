@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from hasrl_jax.config.convert import from_dict
-from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState, StepResult
+from hasrl_jax.envs.cpu_engine import SPLIT_FROM, CpuEnvs, EnvState, StepResult
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Transition
 
 TASK = make_task(from_dict({}))
+DISTURBED = {
+    "cassie": {
+        "command": {"frame": "heading"},
+        "motor": {"torque_speed_curve": True},
+        "randomize": {"floor_slope_deg": [5, 9], "policy_period_scale": [0.8, 1.3], "torque_lag_s": [0.002, 0.004]},
+    }
+}
 LAYING = make_task(from_dict({"cassie": {"termination": {"min_height_m": 0.0, "max_tilt_deg": 180.0}}}))  # never ends
 
 
@@ -160,22 +167,34 @@ def test_restored_environments_go_on_identically() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_batch_equals_plain_mujoco() -> None:
-    envs = CpuEnvs(TASK, 2, 100)
+@pytest.mark.parametrize("config", [{}, DISTURBED], ids=["default", "disturbed"])
+@pytest.mark.parametrize("num_envs", [2, SPLIT_FROM])
+def test_the_batch_equals_plain_mujoco(num_envs: int, config: dict[str, Any]) -> None:
+    task = make_task(from_dict(config))
+    envs = CpuEnvs(task, num_envs, 100)
     rng = np.random.default_rng(3)
     state = envs.reset(rng)
-    action = rng.uniform(-0.5, 0.5, (2, 10))
-    after, _ = envs.step(state, action, rng)
-    for env in range(2):
-        model = make_task(from_dict({})).model
-        model.opt.timestep = state.model_fields["timestep"][env]
+    state, _ = envs.step(state, rng.uniform(-0.5, 0.5, (num_envs, 10)), rng)
+    assert state.physics[:, 1 + task.model.nq + task.model.nv :].any() == bool(config)  # what lags in actuators
+    control = task.control(state.task, rng.uniform(-0.5, 0.5, (num_envs, 10)), np)
+    end, reading, diverged = envs._simulate(state, control[:, None])
+    assert not diverged.any()
+    for env in (0, num_envs - 1):
+        model = make_task(from_dict(config)).model
+        pace = task.pace(state.task, np)[env] if task.pace else 1.0
+        model.opt.timestep = state.model_fields["timestep"][env] * pace
         for name in set(state.model_fields) - {"timestep"}:
             getattr(model, name)[:] = state.model_fields[name][env]
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = np.split(state.physics[env, 1:], [model.nq])
-        data.ctrl[:] = TASK.control(state.task, action, np)[env]
-        mujoco.mj_step(model, data, TASK.steps_per_env_step)
-        np.testing.assert_array_equal(after.physics[env], [data.time, *data.qpos, *data.qvel])
+        mujoco.mj_setState(model, data, state.physics[env], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        data.ctrl[:] = control[env]
+        features = []
+        for _ in range(task.steps_per_env_step):
+            mujoco.mj_step(model, data)
+            features.append(task.physics_features(data.sensordata.copy(), np))
+        np.testing.assert_array_equal(end[env], [data.time, *data.qpos, *data.qvel, *data.act])
+        np.testing.assert_array_equal(reading.sensordata[env], data.sensordata)
+        np.testing.assert_allclose(reading.averages[env], np.mean(features, axis=0), rtol=1e-12)
 
 
 def test_prepared_episodes_end_with_their_generator() -> None:
@@ -204,9 +223,10 @@ def test_episodes_that_follow_one_another_differ() -> None:
     assert len(set(phases)) == len(phases)
 
 
-def test_only_robots_that_differ_have_models_of_their_own() -> None:
+def test_only_robots_that_differ_have_fields_of_their_own() -> None:
     nominal = make_task(from_dict({"cassie": {"randomize": {"enabled": False}}}))
-    for task, expected in ((nominal, 1), (TASK, 3)):
+    for task, drawn in ((nominal, False), (TASK, True)):
         envs = CpuEnvs(task, 3, 100)
-        envs.reset(np.random.default_rng(0))
-        assert len({id(model) for model in envs._models}) == expected
+        state = envs.reset(np.random.default_rng(0))
+        assert set(envs._fields) == set(state.model_fields)
+        assert bool(envs._fields) == drawn

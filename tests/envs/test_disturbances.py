@@ -57,7 +57,8 @@ def test_feet_stand_on_the_slope_and_the_height_is_taken_from_it() -> None:
     for _ in range(10):
         state, result = envs.step(state, np.zeros((4, 10)), rng)
     bottom = model.geom("floor").pos[2]
-    for env, own in enumerate(envs._models):
+    for env in range(envs.num_envs):
+        own = envs._batch.get_model(env)
         slope = state.task.slope[env]
         assert math.hypot(*slope) == pytest.approx(math.tan(math.radians(10)))
         data.qpos[:] = state.physics[env, 1 : 1 + model.nq]

@@ -152,7 +152,7 @@ def _torques(lag_s: float, steps: int) -> np.ndarray:
     task = make_task(from_dict({"cassie": cassie, "physics": {"timestep_s": 0.0005, "steps_per_env_step": 50}}))
     envs = CpuEnvs(task, 1, 10)
     envs.reset(np.random.default_rng(0))
-    model, data = envs._models[0], mujoco.MjData(task.model)
+    model, data = envs._batch.get_model(0), mujoco.MjData(task.model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     model.opt.gravity[:] = 0
     torques = []

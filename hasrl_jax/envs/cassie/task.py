@@ -78,6 +78,7 @@ NUM_ENCODERS = len(MOTOR_SIGNS) + len(_PASSIVE_SIGNS)
 NEUTRAL_RAD = np.array([0.0045, 0.0, 0.4973, -1.1997, -1.5968, -0.0045, 0.0, 0.4973, -1.1997, -1.5968])
 GRAVITY_M_S2 = 9.81
 HEEL_UP = 0.1  # sine of the angle by which a foot points down: of its 0.16 m the heel is 1.6 cm up
+END_SENSORS = ("pelvis-acceleration", "left-foot-velocity", "right-foot-velocity")
 MEASURES = (
     *("forward_speed", "lateral_speed"),  # of the pelvis in the command's frame, at the end of the step, m/s
     *("forward_command", "lateral_command"),  # that held during the environment step, m/s
@@ -234,6 +235,7 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         push_s=config.settings.push.duration_s,
         player_constants=player_constants(constants),
         physics_features=partial(physics_features, constants),
+        end_sensors=tuple(names.sensors.get(name, name) for name in END_SENSORS),
         step=partial(step, constants),
     )
 
