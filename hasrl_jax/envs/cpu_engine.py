@@ -21,6 +21,18 @@ CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
 FORCE = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value
 SPLIT_FROM = 8  # environments from which sensors left out save more than the second call that this takes
 
+# Warnings of a simulation that went bad; a full buffer of contacts is none.
+_BAD = [
+    int(warning)
+    for warning in (
+        mujoco.mjtWarning.mjWARN_INERTIA,
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+]
+
 
 class EnvState(NamedTuple):
     """The complete state of E environments."""
@@ -202,7 +214,7 @@ class CpuEnvs:
         end, sensordata = self._physics.copy(), self._records[-1]["sensordata"][:, -1].copy()
         # MuJoCo resets a simulation that went bad to a finite state, and counts it.
         warnings = self._batch.warning[:, :, 1]
-        warned = warnings.any(axis=1)
+        warned = warnings[:, _BAD].any(axis=1)
         if warned.any():
             warnings[:] = 0
         # A sum is finite where all its numbers are.
