@@ -62,7 +62,8 @@ def run(schedule: str, directory: Path) -> list[Look]:
     """Trains to the end; what was seen of it."""
     command = ["-m", "hasrl_jax.train", *OPTIONS, "--schedule", schedule, "--run-dir", directory]
     looks: list[Look] = []
-    with open(directory.with_suffix(".log"), "w") as log:
+    path = directory.with_suffix(".log")
+    with open(path, "w") as log:
         process = subprocess.Popen([sys.executable, *map(str, command)], stdout=log, stderr=log)
         while process.poll() is None:
             time.sleep(EVERY_S)
@@ -71,7 +72,7 @@ def run(schedule: str, directory: Path) -> list[Look]:
             except (psutil.Error, OSError):  # not yet begun, or over
                 continue
     if process.returncode:
-        raise SystemExit(f"{schedule}: ended with status {process.returncode}: {directory.with_suffix('.log')}")
+        raise SystemExit(f"{path.read_text()[-2000:]}{schedule}: ended with status {process.returncode}")
     return looks
 
 

@@ -22,5 +22,6 @@ def descriptions(settings: type) -> dict[str, str]:
             field = _FIELD.match(line)
             if field and (field["beside"] or above):
                 found[field["name"]] = field["beside"] or above
-            above = line.strip().removeprefix("# ") if line.startswith("    # ") else ""
+            comment = line.strip().removeprefix("# ") if line.startswith("    # ") else ""
+            above = f"{above} {comment}".strip() if comment else ""
     return found

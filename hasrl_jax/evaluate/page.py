@@ -30,20 +30,24 @@ def number(digits: int) -> Callable[[dict[str, Any]], str]:
     return written
 
 
-SURVIVAL: tuple[Column, ...] = (
-    ("up 20 s", "share_up_20_s", percent),
-    ("up to the end", "share_up", percent),
-    ("time limit", "cap_seconds", lambda value: f"{value:g} s"),
-    ("seconds upright", "seconds", number(1)),
-    ("speed, m/s", "forward_speed", number(2)),
-    ("speed error, m/s", "forward_speed_error", number(3)),
-    ("lateral error, m/s", "lateral_speed_error", number(3)),
-    ("heading drift, °", "heading_drift_deg", number(0)),
-)
+UP_20_S: Column = ("up 20 s", "share_up_20_s", percent)
+UP: Column = ("up to the end", "share_up", percent)
+LIMIT: Column = ("time limit", "cap_seconds", lambda value: f"{value:g} s")
+SECONDS: Column = ("seconds upright", "seconds", number(1))
+SPEED: Column = ("speed, m/s", "forward_speed", number(2))
+SPEED_ERROR: Column = ("speed error, m/s", "forward_speed_error", number(3))
+LATERAL_ERROR: Column = ("lateral error, m/s", "lateral_speed_error", number(3))
+DRIFT: Column = ("heading drift, °", "heading_drift_deg", number(0))
+
+ON_MODEL: tuple[Column, ...] = (UP, LIMIT, SECONDS, SPEED, SPEED_ERROR, LATERAL_ERROR)
+SURVIVAL: tuple[Column, ...] = (UP_20_S, *ON_MODEL, DRIFT)
+SHORT: tuple[Column, ...] = (SECONDS, UP_20_S, SPEED, SPEED_ERROR)
 STEERING: tuple[Column, ...] = (
-    *SURVIVAL[:3],
-    SURVIVAL[5],
-    SURVIVAL[6],
+    UP_20_S,
+    UP,
+    LIMIT,
+    SPEED_ERROR,
+    LATERAL_ERROR,
     ("yaw rate, rad/s", "yaw_rate", number(2)),
     ("yaw rate error, rad/s", "yaw_rate_error", number(3)),
     ("height, m", "height", number(2)),
@@ -58,8 +62,6 @@ GAIT: tuple[Column, ...] = (
     ("motor power, W", "motor_power", number(0)),
     ("on the toe, s a step", "trailing_toe_s", number(3)),
 )
-ON_MODEL: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (1, 2, 3, 4, 5, 6))
-SHORT: tuple[Column, ...] = tuple(SURVIVAL[index] for index in (3, 0, 4, 5))
 
 
 def table(rows: Rows, columns: tuple[Column, ...]) -> str:
