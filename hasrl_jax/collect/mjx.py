@@ -303,7 +303,7 @@ class MjxCollector:
 
     def __init__(self, config: Config, task: Task, mesh: Mesh, networks: Networks):
         self.plan = make_mjx_plan(config, config.mjx.num_envs, mesh.size)
-        self._mesh, self._networks = mesh, networks
+        self._mesh, self._networks, self._physics = mesh, networks, config.physics
         self.rollout, self.reward_terms = self._make_rollout(config, task), task.reward_terms
         self.seed = config.seed
         self.busy, self._started = False, 0.0
@@ -343,7 +343,8 @@ class MjxCollector:
         return Experience(trajectory, self.plan.env_steps, record)
 
     def configure(self, config: Config, task: Task) -> None:
-        saved = self.save()
+        saved = self.save() if config.physics == self._physics else []  # as `worker.Actor.configured`
+        self._physics = config.physics
         self.rollout = self._make_rollout(config, task)
         self.state = self.rollout.init(self.seed)
         self.load(saved)

@@ -231,7 +231,7 @@ class CpuPool:
     def configure(self, config: Config) -> None:
         """Changes the settings of the task in every worker; only between `finish` and `start`.
 
-        Episodes go on where the state of the environments keeps its shapes, and begin anew elsewhere.
+        Episodes go on where `worker.Actor.configured` lets them, and begin anew elsewhere.
         """
         self.config = config
         for index in range(self.plan.num_workers):

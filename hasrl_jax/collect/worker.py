@@ -186,6 +186,16 @@ class Actor:
         np.savez(buffer, carry=self.carry, **_flat(self.state))  # type: ignore[arg-type]
         return buffer.getvalue()
 
+    def configured(self, config: Config) -> tuple["Actor", bool]:
+        """One with other settings of the task; whether the episodes go on in it.
+
+        They do where their state keeps its shapes and the physics stays: a robot that was drawn at random carries its
+        physics step with it.
+        """
+        actor = Actor(config, self.plan, self.index)
+        state = self.save() if config.physics == self.config.physics else b""
+        return actor, actor.load(state)
+
     def load(self, data: bytes) -> bool:
         """Restores what `save` returned; False, and nothing changes, when that was nothing or of other settings."""
         saved = dict(np.load(io.BytesIO(data), allow_pickle=False)) if data else {}
@@ -237,9 +247,8 @@ def serve(connection: Connection, descriptor: int) -> None:
         elif message["do"] == "save":
             connection.send_bytes(actor.save())
         elif message["do"] == "configure":
-            state = actor.save()
-            actor = Actor(from_dict(message["config"]), plan, index)
-            reply(connection, {"loaded": actor.load(state)})
+            actor, goes_on = actor.configured(from_dict(message["config"]))
+            reply(connection, {"loaded": goes_on})
         elif message["do"] == "load":
             reply(connection, {"loaded": actor.load(connection.recv_bytes())})
 

@@ -24,7 +24,7 @@ from hasrl_jax.config.schema import Config, StageConfig
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Record
 
-CHANGEABLE = ("ppo", "evaluate")  # what a stage may change besides the task's own settings
+CHANGEABLE = ("physics", "ppo", "evaluate")  # what a stage may change besides the task's own settings
 WINDOW = 10  # values of a metric that are averaged
 NOW_AND_THEN = "eval_"  # how the metrics begin that not every iteration has
 
@@ -40,7 +40,7 @@ def resolve(config: Config) -> list[Config]:
         name = f"stages[{index}]"
         if stage.at_env_steps <= begin:
             raise ConfigError(f"{name}.at_env_steps: got {stage.at_env_steps}; expected more than {begin}")
-        if not stage.set:
+        if not flat(stage.set):
             raise ConfigError(f"{name}.set: got nothing; expected fields and values, {{ppo.clip: 0.1}}")
         begin = stage.at_env_steps
         resolved.append(_apply(stage.set, resolved[-1], name))
@@ -98,6 +98,7 @@ class Stages:
 
 def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
     """`config` with some fields replaced, and checked."""
+    env_step_s = config.physics.env_step_s
     changeable = (*([config.section] if config.section else []), *CHANGEABLE)
     fields = [field for part in changes.items() for field in flat(dict([part]))]
     for field in fields:
@@ -118,4 +119,9 @@ def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
         check(config)
     except ConfigError as error:
         raise ConfigError(f"{name}.set: {error}") from None
+    if not np.isclose(config.physics.env_step_s, env_step_s):
+        raise ConfigError(
+            f"{name}.set: physics.timestep_s times steps_per_env_step is {config.physics.env_step_s:g} s; expected "
+            f"{env_step_s:g} s, as before"
+        )
     return config

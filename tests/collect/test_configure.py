@@ -57,6 +57,14 @@ def test_episodes_begin_anew_where_their_state_gets_another_shape(config: Config
     assert not unchanged.fields["is_first"][::8].all()
 
 
+def test_episodes_begin_anew_under_other_physics(config: Config, parameters: Parameters) -> None:
+    """A robot that was drawn at random carries its physics step, and would keep it."""
+    randomized = from_dict(RANDOMIZED, config)
+    steps = {"timestep_s": 2 * config.physics.timestep_s, "steps_per_env_step": config.physics.steps_per_env_step // 2}
+    _, coarse = two_iterations(randomized, from_dict({"physics": steps}, randomized), parameters)
+    assert coarse.fields["is_first"][::8].all()
+
+
 def test_free_workers_take_new_settings_over_before_their_next_slot(config: Config, parameters: Parameters) -> None:
     config = from_dict({"schedule": "decoupled", "decoupled": {"max_lag": 1000}}, config)
     steep = from_dict({"cassie": {"reward": {"scale": 100.0}}}, config)

@@ -76,6 +76,11 @@ def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
         ([{"at_env_steps": "soon", "set": {"ppo.clip": 0.1}}], r"stages\[0\].at_env_steps: got 'soon'; expected int"),
         ([{"at_env_steps": 0, "set": {"ppo.clip": 0.1}}], r"stages\[0\].at_env_steps: got 0; expected"),
         ([{"at_env_steps": 100}], r"stages\[0\].set: got nothing; expected"),
+        ([{"at_env_steps": 100, "set": {"ppo": {}}}], r"stages\[0\].set: got nothing; expected"),
+        (
+            [{"at_env_steps": 100, "set": {"physics.timestep_s": 0.005}}],
+            r"stages\[0\].set: physics.timestep_s times steps_per_env_step is 0.05 s; expected 0.025 s, as before",
+        ),
         ([{"at_env_steps": 100, "set": {"network.hidden_size": 4}}], r"network.hidden_size cannot change during a run"),
         ([{"at_env_steps": 100, "set": {"cassie.push.force": [0, 1]}}], r"config.cassie.push.force: unknown field"),
         ([{"at_env_steps": 100, "set": {"cassie.push.force_n": [5, 1]}}], r"cassie.push.force_n: got .* low <= high"),

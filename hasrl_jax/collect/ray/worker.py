@@ -47,9 +47,8 @@ class RayWorker:
 
     def configure(self, settings: dict[str, Any]) -> bool:
         """Changes the settings of the task; whether the episodes go on."""
-        state = self.actor.save()
-        self.actor = Actor(from_dict(settings), self.actor.plan, self.actor.index)
-        return self.actor.load(state)
+        self.actor, goes_on = self.actor.configured(from_dict(settings))
+        return goes_on
 
     def save(self) -> bytes:
         return self.actor.save()
