@@ -41,9 +41,9 @@ wheel:  ## wheel and sdist in dist/, checked, installed in an empty environment 
 	$(BIN)/python tools/try_wheel.py dist
 
 COMPILE := uv pip compile --universal --python-version 3.11 --no-header --no-annotate pyproject.toml
-EXTRAS := $(foreach name,cuda deploy dev docs menagerie mutation ray release viewer,--extra $(name))
+EXTRAS := $(foreach name,cuda deploy dev docs menagerie mlflow mutation ray release viewer,--extra $(name))
 
-# Left out: `compare` and `frameworks`, whose torch is the platform's, and `mlflow`, `sweep` and `wandb`.
+# Left out: `compare` and `frameworks`, whose torch is the platform's, and `sweep` and `wandb`, which fit in with it.
 lock:  ## after a change of dependencies in pyproject.toml
 	$(BIN)/pip install uv
 	$(BIN)/$(COMPILE) $(EXTRAS) -o requirements.lock

@@ -38,6 +38,14 @@ def test_images_install_what_the_lock_pins_by_hash(variant: str) -> None:
     assert any(name.startswith("jax-cuda12") for name, _ in pins) == (variant == "cuda")
 
 
+def test_the_lock_pins_every_extra_that_the_makefile_names() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    locked = re.search(r"foreach name,([\w ]+),", (ROOT / "Makefile").read_text())
+    assert locked and {"cuda", "mlflow", "viewer"} <= set(locked[1].split())
+    needed = {re.split(r"[<>=\[]", entry)[0].lower() for name in locked[1].split() for entry in extras[name]}
+    assert needed <= {name for name, _ in _pins(ROOT / "requirements.lock")}
+
+
 def test_the_image_copies_what_there_is_and_builds_as_the_wheel() -> None:
     text = (ROOT / "Dockerfile").read_text()
     sources = [word for line in re.findall(r"^COPY (.*) \S+$", text, re.MULTILINE) for word in line.split()]

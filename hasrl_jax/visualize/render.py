@@ -108,7 +108,7 @@ def caption(moment: Moment, commands: "tuple[Command, ...]") -> str:
 def followed(command: "Command", measures: dict[str, float]) -> str:
     """A command's measure beside what was asked for."""
     measured, asked = measures[command.measure], measures[f"{command.name}_command"]
-    return f"{measured:+.2f} of {asked:+.2f} {command.unit}"
+    return f"{measured:+z.2f} of {asked:+z.2f} {command.unit}"
 
 
 def draw_text(image: np.ndarray, text: str) -> np.ndarray:

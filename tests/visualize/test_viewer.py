@@ -97,7 +97,7 @@ def test_falls_begin_another_episode_and_are_counted(live: Live) -> None:
     assert live.view().falls == before + 1
     assert live.view().randomized
     assert live.view().time_s == 0
-    assert dict(readout(live.view(), live.commands, 1.0))["falls"].endswith("the last episode ended: fell")
+    assert dict(readout(live.view(), live.commands, 1.0))["falls"] == f"{before + 1}, last end: fell"
 
 
 def test_a_randomized_robot_has_steps_of_its_own(live: Live) -> None:
@@ -126,7 +126,8 @@ def test_any_task_is_shown() -> None:
     live.advance(Controls(randomized=True))
     assert (live.commands, live.can_push, live.can_randomize, live.view().randomized) == ((), False, False, False)
     rows = dict(readout(live.view(), live.commands, 1.0))
-    assert float(rows["angle"]) == pytest.approx(live.view().measures["angle"], abs=0.01)
+    number, unit = rows["angle"].split()
+    assert (float(number), unit) == (pytest.approx(live.view().measures["angle"], abs=0.01), "rad")
 
 
 def test_the_ground_of_an_episode_is_shown() -> None:
@@ -165,6 +166,14 @@ def test_the_readout_says_when_it_is_behind(live: Live) -> None:
     assert rows["pace"] == "behind: 50% of real time"
     assert rows["forward"].endswith("of +0.40 m/s")
     assert dict(readout(live.view(), live.commands, 1.0))["pace"] == "real time"
+
+
+def test_nothing_is_minus_zero(live: Live) -> None:
+    view = live.view()
+    zeros = view._replace(measures=dict.fromkeys(view.measures, -1e-4))
+    rows = dict(readout(zeros, live.commands, 1.0))
+    assert rows["forward"] == "+0.00 of +0.00 m/s"
+    assert rows["height"] == "+0.00 m"
 
 
 def test_shapes_have_the_size_that_mujoco_gives_them(live: Live) -> None:
@@ -220,6 +229,21 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
     finally:
         page.close()
     assert browser.free_port(port) == port  # nothing listens any more
+
+
+def test_what_is_typed_beyond_the_ends_of_a_slider_counts_as_its_ends(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live, port=0)
+    try:
+        for slider, typed in ((page._sliders[0], 40.0), (page._sliders[1], -40.0), (page._force, 4000.0)):
+            slider.value = typed
+        page._push = True
+        forward, lateral = live.commands
+        controls = page.controls()
+        assert controls.command == (forward.drawn[1], lateral.drawn[0])
+        assert controls.push == Push(browser.PUSH_N[1], 90.0)
+    finally:
+        page.close()
 
 
 def _get(url: str, **headers: str) -> tuple[int, str, dict[str, str]]:

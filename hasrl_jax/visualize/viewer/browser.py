@@ -64,16 +64,16 @@ class Browser:
         self._build_scene(live.model)
 
     def controls(self) -> Controls:
-        """What the panel asks for now; a click counts once."""
+        """What the panel asks for now; a click counts once. Numbers typed beyond a slider's ends count as its ends."""
         with self._lock:
             reset, push = self._reset, self._push
             self._reset, self._push = False, False
         return Controls(
-            command=tuple(float(slider.value) for slider in self._sliders),
+            command=tuple(_within(slider) for slider in self._sliders),
             paused=bool(self._paused.value),
             randomized=self._robot is not None and self._robot.value == "randomised",
             reset=reset,
-            push=Push(float(self._force.value), DIRECTIONS_DEG[self._direction.value]) if push else None,
+            push=Push(_within(self._force), DIRECTIONS_DEG[self._direction.value]) if push else None,
         )
 
     def show(self, view: View, pace: float) -> None:
@@ -104,7 +104,7 @@ class Browser:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._readout = gui.add_markdown("")
-        self._sliders: list[viser.GuiInputHandle[float]] = []
+        self._sliders: list[viser.GuiSliderHandle[float]] = []
         if live.commands:
             with gui.add_folder("Command"):
                 self._sliders = [self._slider(command) for command in live.commands]
@@ -123,7 +123,7 @@ class Browser:
             self._follow = gui.add_checkbox("camera follows", True)
             gui.add_button("reset").on_click(self._ask_for_reset)
 
-    def _slider(self, command: Command) -> "viser.GuiInputHandle[float]":
+    def _slider(self, command: Command) -> "viser.GuiSliderHandle[float]":
         """A slider over what the policy was trained for; a command that was never drawn stays where it was."""
         low, high = command.drawn
         name = f"{command.name.replace('_', ' ')} {command.unit}"
@@ -193,6 +193,11 @@ class Browser:
             half = math.radians(view.push.direction_deg) / 2
             self._arrow.position = pelvis
             self._arrow.wxyz = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+def _within(slider: "viser.GuiSliderHandle[float]") -> float:
+    """The value of a slider; its box passes on what is typed as it is typed, and cuts it off only later."""
+    return min(max(float(slider.value), float(slider.min)), float(slider.max))
 
 
 def camera(aspect: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

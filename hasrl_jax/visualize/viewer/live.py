@@ -24,6 +24,7 @@ from hasrl_jax.visualize.render import AVERAGE_S, followed, recent_means
 
 MAX_BEHIND_S = 0.1  # what is missed beyond this is given up, not caught up with
 PACE_WINDOW_S = 1.0  # over which the pace is measured
+UNITS = {"height": "m", "heading_error": "rad", "angle": "rad"}  # of the measures that have a line of their own
 
 
 class Push(NamedTuple):
@@ -210,8 +211,9 @@ def readout(view: View, commands: tuple[Command, ...], pace: float) -> list[tupl
         rows.append(("feet", f"left {measures['left_force']:.0f} N, right {measures['right_force']:.0f} N"))
     if "motor_power" in measures:
         rows.append(("motors", f"{measures['motor_power']:.0f} W"))
-    rows += [(name.replace("_", " "), f"{value:+.2f}") for name, value in measures.items() if name not in shown]
-    rows.append(("falls", f"{view.falls}" + (f"; the last episode ended: {view.last_end}" if view.last_end else "")))
+    others = {name: value for name, value in measures.items() if name not in shown}
+    rows += [(name.replace("_", " "), f"{value:+z.2f} {UNITS.get(name, '')}".strip()) for name, value in others.items()]
+    rows.append(("falls", f"{view.falls}" + (f", last end: {view.last_end}" if view.last_end else "")))
     rows.append(("robot", "randomised" if view.randomized else "nominal"))
     rows.append(("pace", "real time" if pace > 0.95 else f"behind: {pace:.0%} of real time"))
     return rows
