@@ -44,8 +44,10 @@ def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 
     Raises:
-      ConfigError: the name has not the `suffix`, there is no such folder, or nothing can be written there.
+      ConfigError: that is a folder, the name has not the `suffix`, there is no such folder, or nothing can be written there.
     """
+    if path.is_dir():
+        raise ConfigError(f"{option}: got {path}, a folder; expected a file, {path / f'NAME{suffix}'}")
     if suffix and path.suffix.lower() != suffix:
         raise ConfigError(f"{option}: got {path}; expected a name that ends in {suffix}")
     if not path.parent.is_dir():

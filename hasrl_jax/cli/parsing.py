@@ -28,6 +28,8 @@ from hasrl_jax.errors import ConfigError, HasrlError
 from hasrl_jax.policy.loading import load_policy_parameters, under_reference_physics
 from hasrl_jax.policy.numpy_networks import Parameters
 
+PYTHONS_WORDS = re.compile(r"(?P<kind>could not convert|invalid literal)[^:]*: (?P<value>'.*')")
+NUMBERS = {"could not convert": "a number", "invalid literal": "a whole number"}
 SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
 
 
@@ -236,7 +238,8 @@ def _refuse_unknown_options(arguments: list[str], base: Config) -> None:
     for argument in arguments:
         option = option_name(argument)
         if option.startswith("--") and option not in {*known, "--help"}:
-            closest = difflib.get_close_matches(option, known, n=1)
+            inside = [field for field in known if f".{option[2:]}" in field]  # its end alone, --forward
+            closest = difflib.get_close_matches(option, known, n=1) or inside
             hint = f"did you mean {closest[0]}?" if closest else "see --help"
             raise ConfigError(f"{argument.partition('=')[0]}: unknown option; {hint}")
 
@@ -246,5 +249,5 @@ def _one_line(complaint: str) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
     lines = [line.strip(" │╭╮╰╯─") for line in plain.splitlines()][1:]
     blocks = itertools.groupby(lines, lambda line: bool(line.strip("-")))  # rules separate them
-    first = next((" ".join(block) for has_text, block in blocks if has_text), "")
-    return first or " ".join(plain.split())
+    first = next((" ".join(block) for has_text, block in blocks if has_text), "") or " ".join(plain.split())
+    return PYTHONS_WORDS.sub(lambda found: f"got {found['value']}; expected {NUMBERS[found['kind']]}", first)

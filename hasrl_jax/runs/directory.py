@@ -120,7 +120,8 @@ def _create(config: Config) -> Path:
                     raise
         raise RunError(f"{path}: too many runs were started in the same second")
     except OSError as error:
-        raise RunError(f"{path}: the run directory cannot be created: {_reason(error)}") from None
+        reason = "that is a file; expected a folder" if path.is_file() else _reason(error)
+        raise RunError(f"{path}: the run directory cannot be created: {reason}") from None
 
 
 def _protected(path: Path, config: Config) -> Path:

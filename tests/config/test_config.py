@@ -111,6 +111,12 @@ def test_a_refusal_says_what_would_work():
     base = shipped("cassie_walk")
     with pytest.raises(ConfigError, match=r"^--ppo\.clop: unknown option; did you mean --ppo\.clip\?$"):
         cli.override(base, ["--ppo.clop=1"], "train")
+    with pytest.raises(ConfigError, match=r"^--forward: unknown option; did you mean --cassie.command.forward-m-s\?$"):
+        cli.override(base, ["--forward", "1"], "train")
+    with pytest.raises(ConfigError, match=r"--ppo.clip: got 'abc'; expected a number$"):
+        cli.override(base, ["--ppo.clip", "abc"], "train")
+    with pytest.raises(ConfigError, match=r"--seed: got '1.5'; expected a whole number$"):
+        cli.override(base, ["--seed", "1.5"], "train")
     with pytest.raises(ConfigError, match=r"^task: got 'hopper'; expected cassie, cartpole.*, or MODULE:NAME"):
         cli.override(base, ["--task", "hopper"], "train")
     with pytest.raises(ConfigError, match=r"^ppo\.clip: got 2\.0; expected 0\.001 to 0\.999$"):

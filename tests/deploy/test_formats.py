@@ -143,6 +143,7 @@ def test_the_three_files_say_the_same_and_an_exported_policy_loads(tmp_path):
     [
         (["--policy", "released", "--out", "x.txt"], "--out: got x.txt; expected a name that ends in .npz"),
         (["--policy", "released", "--format", "onnx", "--out", "x.npz"], "--out: got x.npz; .* ends in .onnx"),
+        (["--policy", "released", "--out", "."], r"--out: got \., a folder; expected a file, NAME\.npz"),
         (["--policy", "released"], "--out: missing; expected the file to write, or --model"),
         (["--out", "x.npz"], "--run-dir: missing; expected a run directory, or --policy"),
         (["--policy", "released", "--model", "x.mjb"], "--model: got x.mjb; expected a name that ends in .xml"),

@@ -186,8 +186,8 @@ def test_a_configuration_from_before_a_setting_existed_is_read(tmp_path: Path) -
 
 def test_directory_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    for name in ("file", "file/run"):
-        with pytest.raises(RunError, match=f"{tmp_path / name}: the run directory cannot be created: "):
+    for name, reason in (("file", "that is a file; expected a folder"), ("file/run", "Not a directory")):
+        with pytest.raises(RunError, match=f"{tmp_path / name}: the run directory cannot be created: {reason}"):
             open_run(config_for(tmp_path / name), resume=False).__enter__()
 
 

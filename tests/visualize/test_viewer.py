@@ -211,6 +211,8 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
             assert answer.status == 200
         with pytest.raises(ConfigError, match=f"--port: got {port}"):
             browser.free_port(port)
+        with pytest.raises(ConfigError, match=r"--host: got nowhere\.invalid, which is no address of this machine"):
+            browser.free_port(port, "nowhere.invalid")
 
         steps = iter(range(20))
         live.advance(Controls(reset=True))

@@ -230,6 +230,10 @@ def free_port(port: int, host: str = HOST) -> int:
     Raises:
       ConfigError: it cannot.
     """
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"--host: got {host}, which is no address of this machine ({error})") from None
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
