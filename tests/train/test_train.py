@@ -94,7 +94,7 @@ def test_the_command_trains_cassie_for_two_iterations(tmp_path):
         command(*arguments, *small), capture_output=True, text=True, cwd=ROOT, env=os.environ | {"XLA_FLAGS": ""}
     )
     assert finished.returncode == 0, finished.stderr
-    for expected in ("backend cpu_pool", "cpu", "1 workers", "physics 200 Hz", str(run)):
+    for expected in ("backend cpu_pool", "cpu", "1 workers", "physics 400 Hz", str(run)):
         assert expected in finished.stderr
     assert "iteration 2" in finished.stdout
     first, second = records(run)
