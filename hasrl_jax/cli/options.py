@@ -19,7 +19,7 @@ def add_policy_options(parser: argparse.ArgumentParser) -> None:
     """The options of every program that plays a policy, see `policies.load_policy_parameters`."""
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
     parser.add_argument(
-        "--policy", help="a policy file (.npz), released (the default), released-steer, released-stairs"
+        "--policy", help="a policy file (.npz), released (the default), released-steer, -stairs or -imitate"
     )
     parser.add_argument(
         "--physics", choices=("paper", "training"), default="paper", help="2 kHz (Cassie), or as trained"
@@ -44,7 +44,7 @@ def require_writable(option: str, path: Path, suffix: str = "") -> None:
     """Proves that the file can be written, and leaves it as it is.
 
     Raises:
-      ConfigError: that is a folder, the name has not the `suffix`, there is no such folder, or nothing can be written there.
+      ConfigError: that is a folder, the name has not the `suffix`, its folder does not exist or cannot be written to.
     """
     if path.is_dir():
         raise ConfigError(f"{option}: got {path}, a folder; expected a file, {path / f'NAME{suffix}'}")

@@ -48,6 +48,19 @@ def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
     assert not rollout.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
 
 
+def test_the_policy_that_imitates_walks_with_the_joints_of_its_reference() -> None:
+    config, parameters = policies.load_policy_parameters(None, "released-imitate")
+    changes = {"command": {"forward_m_s": [0.7, 0.7], "stand_probability": 0.0, "resample_s": [0, 0]}}
+    changes["reference"] = {"start_share": 0.0}
+    config = from_dict({"cassie": changes, "collect": {"max_episode_steps": 200}}, config)
+    task = make_task(config)
+    episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
+    assert episodes.reached_cap.all()
+    forward = episodes.measures[120:, :, task.measures.index("forward_speed")]
+    np.testing.assert_allclose(forward.mean(axis=0), 0.7, atol=0.1)
+    assert (episodes.episode_return > 0.8 * 200).all(), "1 a step is the reference itself"
+
+
 def test_the_policy_that_steers_turns_sidesteps_and_crouches_as_it_is_told() -> None:
     config, parameters = policies.load_policy_parameters(None, "released-steer")
     told = {"forward_m_s": 0.8, "lateral_m_s": 0.2, "yaw_rate_rad_s": 0.4, "height_m": 0.8}
