@@ -25,7 +25,8 @@ DOCUMENTS = (
     *("CONTRIBUTING.md", "README.md"),
     *(f"docs/{name}.md" for name in ("index", "start", "install", "concepts", "howto", "troubleshooting", "faq")),
     *(f"docs/tutorials/{name}.md" for name in ("play", "train")),
-    *(f"docs/policies/{name}.md" for name in ("index", "released", "released-steer", "released-stairs", "released-imitate")),
+    *(f"docs/policies/{name}.md" for name in ("index", "released")),
+    *(f"docs/policies/released-{name}.md" for name in ("steer", "stairs", "imitate")),
 )
 FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")
 COMMAND = re.compile(r"(?:\bhasrl |-m hasrl_jax\.)([a-z]+) ([^|#;&`\n]*)")

@@ -285,6 +285,23 @@ def _with(**changes: Any) -> Config:
     return dataclasses.replace(CONFIG, collect=dataclasses.replace(CONFIG.collect, **changes))
 
 
+def test_episodes_go_on_in_another_stage_unless_its_physics_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    rollout = SimpleNamespace(init=lambda seed: {"angle": np.zeros(3)})
+    monkeypatch.setattr(MjxCollector, "_make_rollout", lambda *_: rollout)
+    config, task = from_dict({"mjx": {"num_envs": 8}}, CONFIG), make_task(CONFIG)
+    networks = Networks(*make_networks(CONFIG.network, task.observation_size, task.action_size, task.mirror))
+    with MjxCollector(config, task, make_mesh(jax.devices()[:1]), networks) as collector:
+        collector.state = {"angle": np.ones(3)}
+        collector.configure(config, task)
+        np.testing.assert_array_equal(collector.state["angle"], 1.0)
+        finer = {
+            "timestep_s": config.physics.timestep_s / 2,
+            "steps_per_env_step": 2 * config.physics.steps_per_env_step,
+        }
+        collector.configure(from_dict({"physics": finer}, config), task)
+        np.testing.assert_array_equal(collector.state["angle"], 0.0)
+
+
 def test_the_plan_fills_whole_minibatches() -> None:
     plan = make_mjx_plan(_with(env_steps_per_iteration=1), num_envs=6, num_devices=2)
     assert (plan.steps_per_env, plan.rows, plan.carry_shape) == (32, 24, (2, 2, 16))
