@@ -76,7 +76,7 @@ def test_a_policy_card_has_the_hash_and_the_ranges_of_the_file() -> None:
     rows = _rows(reference.policy_facts("released-stairs"))
     assert re.fullmatch(r"`[0-9a-f]{64}`", rows["SHA-256"][0])
     assert rows["ground"] == ["steps"]
-    assert rows["commands that it was trained for"][0].startswith("forward [0.0, 1.2] m/s")
+    assert rows["commands that it was trained for"][0].startswith("forward [0.2, 1.5] m/s")
 
 
 def test_links_of_the_root_hold_inside_docs() -> None:

@@ -34,7 +34,7 @@ EXPECTED = f"a policy file, or one of {', '.join(RELEASED)}"
 RELEASED_SHA256 = {
     "released": "a848c5a08b333bcc5d869a874a3b3bdbe69af6a580e4a3739e6c992f393d575f",
     "released-steer": "46a840064f5ea73b65d25d8d87e1267deb120e56ca8efa43a0d11f97af03a8a8",
-    "released-stairs": "a3c2a6994789537a3cf7b25fb903cdae07ff3e1bac6045af2fb8ea5631c23ce6",
+    "released-stairs": "08154efe70f6ef10500cb58af1975e42eb9804834d33809cef6587bb9e747955",
     "released-imitate": "404d32723b025372d7d04b97b978f70472b63510093d9747041f9dcd8ec9c68c",
 }
 

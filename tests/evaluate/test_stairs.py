@@ -102,7 +102,7 @@ def test_bad_arguments(arguments: list[str], message: str, capsys: pytest.Captur
 
 
 def test_the_policy_of_an_earlier_configuration_still_loads() -> None:
-    config, _ = loading.load_policy_parameters(None, "released-stairs")
+    config, _ = loading.load_policy_parameters(None, "released")
     settings = config.settings
-    assert (settings.observe, settings.terrain.kind, settings.terrain.steps) == ("state", "steps", (8, 8))
+    assert (settings.observe, settings.terrain.kind, settings.terrain.steps) == ("state", "flat", (8, 8))
     assert (settings.terrain.step_noise_m, settings.terrain.average_m, config.network.memory) == (0.0, 0.0, "lstm")

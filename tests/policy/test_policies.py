@@ -36,14 +36,16 @@ def test_the_released_policy_walks_at_the_commanded_speed() -> None:
 
 
 def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
+    still = dict.fromkeys(("lateral_m_s", "yaw_rate_rad_s", "resample_s"), [0.0, 0.0])
     ground = {
-        "terrain": {"step_height_m": [0.1, 0.1]},
-        "command": {"forward_m_s": [0.5, 0.5], "stand_probability": 0.0},
+        "terrain": {"step_height_m": [0.15, 0.15], "approach_m": [0.0, 0.0], "level_share": 0.0},
+        "command": {"forward_m_s": [0.75, 0.75], "stand_probability": 0.0, **still},
     }
     stairs, its_parameters = policies.load_policy_parameters(None, "released-stairs")
+    assert stairs.settings.observe == "blind"
     config = from_dict({"cassie": ground, "collect": {"max_episode_steps": 320}}, stairs)
     task = make_task(config)
-    _, other_parameters = policies.load_policy_parameters(None, "released")
+    _, other_parameters = policies.load_policy_parameters(None, "released-steer")
     assert rollout.run_episodes(config, task, its_parameters, episodes=3, seed=0).reached_cap.all()
     assert not rollout.run_episodes(config, task, other_parameters, episodes=3, seed=0).reached_cap.any()
 
