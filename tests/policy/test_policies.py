@@ -36,7 +36,7 @@ def test_the_released_policy_walks_at_the_commanded_speed() -> None:
 
 
 def test_the_policy_for_stairs_climbs_where_the_other_falls() -> None:
-    still = dict.fromkeys(("lateral_m_s", "yaw_rate_rad_s", "resample_s"), [0.0, 0.0])
+    still = dict.fromkeys(("lateral_m_s", "yaw_rate_rad_s", "resample_s"), (0.0, 0.0))
     ground = {
         "terrain": {"step_height_m": [0.15, 0.15], "approach_m": [0.0, 0.0], "level_share": 0.0},
         "command": {"forward_m_s": [0.75, 0.75], "stand_probability": 0.0, **still},
