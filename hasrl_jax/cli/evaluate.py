@@ -15,7 +15,6 @@ from hasrl_jax.cli.options import (
 )
 from hasrl_jax.cli.parsing import (
     log_to_terminal,
-    policy_to_play,
     refuse_untrained,
     robot_of,
     run,
@@ -53,12 +52,13 @@ def evaluate(arguments: list[str]) -> None:
         played = _side_by_side(known, rest)
         stairs.write(known.stairs, played, known.episodes, known.seed, _command(arguments))
         return
-    config, parameters = policy_to_play(known, rest, "evaluate")
+    trained, parameters = load_policy_parameters(known.run_dir, known.policy)
+    config = to_play(trained, known.physics, rest, "evaluate")
     robot = robot_of(known)
     task = make_task_on(config, robot) if robot else make_task(config)
-    trained = trained_commands(load_policy_parameters(known.run_dir, known.policy)[0])
+    told = trained_commands(trained)
     for command in task.commands:
-        refuse_untrained(command.name, command.drawn, trained, known.force)
+        refuse_untrained(command.name, command.drawn, told, known.force)
     episodes = run_episodes(
         config, task, parameters, known.episodes, known.seed, not known.stochastic, seconds=known.seconds
     )
