@@ -191,7 +191,7 @@ def physics_only(engine: MjxEngine, mesh: Mesh, steps_per_env: int) -> Callable[
         def env_step(state: MjxEnvState, key: Array) -> tuple[MjxEnvState, None]:
             action = 0.2 * jax.random.normal(key, (len(state.qpos), engine.task.action_size))
             with jax.default_matmul_precision("highest"):  # as the environment does
-                reading, _ = jax.vmap(engine.simulate)(state, engine.task.control(state.task, action, jnp))
+                reading, _ = jax.vmap(engine.simulate)(state, jax.vmap(engine.control)(state, action))
             bad = ~jnp.isfinite(reading.qvel).all(axis=1, keepdims=True)
             qpos, qvel = jnp.where(bad, state.qpos, reading.qpos), jnp.where(bad, 0.0, reading.qvel)
             # The averages are used, or the compiler would leave them out.

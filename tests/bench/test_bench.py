@@ -4,17 +4,23 @@ import itertools
 import json
 import math
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import psutil
 import pytest
 from PIL import Image
 
 from hasrl_jax.bench import mjx, report, walking
 from hasrl_jax.cli.bench import main
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs.mjx_engine import make_engine
+from hasrl_jax.envs.registry import make_task
 from hasrl_jax.learn import ppo
 
 TINY = """
@@ -63,6 +69,17 @@ def test_mjx_measures_and_draws(tiny: str, tmp_path: Path, capsys: pytest.Captur
     assert cell["physics_share"] + cell["policy_share"] + cell["learner_share"] == pytest.approx(1.0)
     with Image.open(picture) as image:
         assert image.size[0] > image.size[1] > 300
+
+
+def test_mjx_times_all_physics_steps_of_an_environment_step() -> None:
+    config = from_dict({"task": "cartpole", "physics": {"steps_per_env_step": 2}})
+    engine = make_engine(make_task(config), "jax", 10)
+    start = jax.vmap(engine.reset)(jax.random.split(jax.random.PRNGKey(0), 8))
+    action = 0.2 * jax.random.normal(jax.random.split(jax.random.PRNGKey(0), 1)[0], (1, 1))  # a device's only one
+    expected = jax.vmap(partial(engine.advance, uniforms=jnp.zeros(0)))(start, jnp.repeat(action, 8, axis=0))
+    found = mjx.physics_only(engine, ppo.make_mesh(), 1)(start)
+    np.testing.assert_allclose(found, expected[0].qpos, atol=1e-7)
+    assert np.abs(found - start.qpos).max() > 1e-4
 
 
 def test_mjx_stops_where_the_memory_ends(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
