@@ -32,14 +32,15 @@ OBSERVATION = (
 )
 ACTION = (Entry("torques", "", LEGS, legs=True),)  # as a share of their limit
 SPEED_LIMITS_M_S = (-2.0, 4.0)
+THIGHS = np.array([0, 0, 0, 0.5, 0, 0, -0.5, 0, 0])  # each thigh's share of the angle between them, by coordinate
 
 
 @dataclass(frozen=True)
 class Settings:
     speed_m_s: Annotated[Range, Limits(*SPEED_LIMITS_M_S)] = (0.5, 1.5)  # range of the commanded speed
     sharpness: Annotated[float, Limits(0.1, 100)] = 2.0  # of exp(-sharpness * error^2), s^2/m^2
-    # What makes it walk and not hop: the thighs apart by stride_rad * sin(2 pi phase)
-    gait: Annotated[float, Limits(0, 10)] = 0.5  # weight of exp(-8 * error^2) of that
+    # What makes it walk and not hop: the thighs apart by stride_rad * sin(2 pi phase), and it starts like that
+    gait: Annotated[float, Limits(0, 10)] = 1.0  # weight of exp(-8 * error^2) of that
     stride_rad: Annotated[float, Limits(0, 2)] = 0.6  # amplitude
     cycle_s: Annotated[float, Limits(0.1, 10)] = 0.8  # of the clock
     effort: Annotated[float, Limits(0, 10)] = 0.02  # weight of the summed squared torques
@@ -81,9 +82,10 @@ def make(config: Config) -> Task:
 
 
 def reset(settings: Settings, start: np.ndarray, uniforms: Array, xp: Any) -> Reset:
-    """Upright, with a little noise, from uniform numbers [..., 2 + nq]."""
+    """Upright, in mid-stride, with a little noise, from uniform numbers [..., 2 + nq]."""
     state = WalkerState(between(uniforms[..., 0], settings.speed_m_s), uniforms[..., 1])
-    qpos = start + between(uniforms[..., 2:], (-settings.start_noise, settings.start_noise))
+    stride = settings.stride_rad * xp.sin(2 * np.pi * state.phase)
+    qpos = start + stride[..., None] * THIGHS + between(uniforms[..., 2:], (-settings.start_noise, settings.start_noise))
     qvel = xp.zeros_like(qpos)
     return Reset(state, observe(state, qpos, qvel, xp), qpos, qvel, {})
 
