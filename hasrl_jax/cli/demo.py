@@ -18,7 +18,9 @@ def main(argv: list[str] | None = None) -> int:
         description="Watch a released policy, command it and push it in the browser; or film it.",
         allow_abbrev=False,
     )
-    parser.add_argument("--policy", default="released", help="released (default), released-steer, -stairs or -imitate")
+    parser.add_argument(
+        "--policy", default="released", help="released (default), released-steer, -fast, -stairs or -imitate"
+    )
     parser.add_argument("--headless", action="store_true", help="write a film instead of opening a page")
     parser.add_argument("--out", type=Path, default=Path("demo.mp4"), help="the film of --headless")
     parser.add_argument("--seconds", type=float, default=12.0, help="of the film")

@@ -19,7 +19,7 @@ def add_policy_options(parser: argparse.ArgumentParser) -> None:
     """The options of every program that plays a policy, see `policies.load_policy_parameters`."""
     parser.add_argument("--run-dir", type=Path, help="a run directory; its newest checkpoint is played")
     parser.add_argument(
-        "--policy", help="a policy file (.npz), released (the default), released-steer, -stairs or -imitate"
+        "--policy", help="a policy file (.npz), released (the default), released-steer, -fast, -stairs or -imitate"
     )
     parser.add_argument(
         "--physics", choices=("paper", "training"), default="paper", help="2 kHz (Cassie), or as trained"

@@ -85,7 +85,9 @@ def reset(settings: Settings, start: np.ndarray, uniforms: Array, xp: Any) -> Re
     """Upright, in mid-stride, with a little noise, from uniform numbers [..., 2 + nq]."""
     state = WalkerState(between(uniforms[..., 0], settings.speed_m_s), uniforms[..., 1])
     stride = settings.stride_rad * xp.sin(2 * np.pi * state.phase)
-    qpos = start + stride[..., None] * THIGHS + between(uniforms[..., 2:], (-settings.start_noise, settings.start_noise))
+    qpos = (
+        start + stride[..., None] * THIGHS + between(uniforms[..., 2:], (-settings.start_noise, settings.start_noise))
+    )
     qvel = xp.zeros_like(qpos)
     return Reset(state, observe(state, qpos, qvel, xp), qpos, qvel, {})
 
