@@ -63,6 +63,24 @@ def test_the_policy_that_imitates_walks_with_the_joints_of_its_reference() -> No
     assert (episodes.episode_return > 0.8 * 200).all(), "1 a step is the reference itself"
 
 
+def test_the_fast_policy_goes_on_where_the_one_that_steers_ends() -> None:
+    speeds = {}
+    for name in ("released-steer", "released-fast"):
+        config, parameters = policies.load_policy_parameters(None, name)
+        command = {"forward_m_s": [4.0, 4.0], "lateral_m_s": [0.0, 0.0], "yaw_rate_rad_s": [0.0, 0.0]}
+        command |= {"height_m": [0.9, 0.9], "resample_s": [0, 0], "start_moving": 0.0, "start_heading_rad": 0.0}
+        command |= dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0)
+        changes = {"command": command, "randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}
+        changes["termination"] = {"max_lag_m": 1e6}  # a bound of its training, which it passes when it sets off
+        config = from_dict({"cassie": changes, "collect": {"max_episode_steps": 200}}, config)
+        task = make_task(config)
+        episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
+        assert episodes.reached_cap.all()
+        speeds[name] = episodes.measures[120:, :, task.measures.index("forward_speed")].mean()
+    assert speeds["released-steer"] < 3.0
+    assert speeds["released-fast"] > 3.3
+
+
 def test_the_policy_that_steers_turns_sidesteps_and_crouches_as_it_is_told() -> None:
     config, parameters = policies.load_policy_parameters(None, "released-steer")
     told = {"forward_m_s": 0.8, "lateral_m_s": 0.2, "yaw_rate_rad_s": 0.4, "height_m": 0.8}
