@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from hasrl_jax.cli import export
+from hasrl_jax.cli.parsing import to_play
 from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import CheckpointError, ConfigError
-from hasrl_jax.evaluate import rollout, statistics
+from hasrl_jax.evaluate import rollout, scorecard, statistics
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy import loading as policies
 from hasrl_jax.policy import numpy_networks as numpy_policy
@@ -67,12 +68,8 @@ def test_the_fast_policy_goes_on_where_the_one_that_steers_ends() -> None:
     speeds = {}
     for name in ("released-steer", "released-fast"):
         config, parameters = policies.load_policy_parameters(None, name)
-        command = {"forward_m_s": [4.0, 4.0], "lateral_m_s": [0.0, 0.0], "yaw_rate_rad_s": [0.0, 0.0]}
-        command |= {"height_m": [0.9, 0.9], "resample_s": [0, 0], "start_moving": 0.0, "start_heading_rad": 0.0}
-        command |= dict.fromkeys(("stand_probability", "straight_probability", "alone_probability"), 0.0)
-        changes = {"command": command, "randomize": {"enabled": False}, "push": {"force_n": [0, 0]}}
-        changes["termination"] = {"max_lag_m": 1e6}  # a bound of its training, which it passes when it sets off
-        config = from_dict({"cassie": changes, "collect": {"max_episode_steps": 200}}, config)
+        played = to_play(config, "training", [], "evaluate")
+        config = scorecard.row_config(played, scorecard.Row("speed", (4.0, 4.0)), seconds=5.0)
         task = make_task(config)
         episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
         assert episodes.reached_cap.all()
