@@ -10,6 +10,7 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import load_yaml, recipe
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import require_same_meaning
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.runs.directory import load_run_config
 from hasrl_jax.train.loop import train
@@ -66,10 +67,7 @@ def _require_same_meaning(trained: Config, config: Config) -> None:
         its, ours = getattr(trained.network, name), getattr(config.network, name)
         if its != ours:
             raise ConfigError(f"network.{name}: got {ours}; this run has learnt with {its}, so leave it at that")
-    theirs, ours = (make_task(one) for one in (trained, config))
-    if theirs.observation != ours.observation:
-        seen = ", ".join(entry.name for entry in set(theirs.observation) ^ set(ours.observation))
-        raise ConfigError(f"{config.section}: these settings change what the policy sees ({seen}); use --init-policy")
+    require_same_meaning(config.section, make_task(trained), make_task(config))
 
 
 def main(argv: list[str] | None = None) -> int:

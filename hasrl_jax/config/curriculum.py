@@ -11,6 +11,7 @@ What a stage sets stays set. A stage with `wait_for` begins when each metric, av
 also reached its value; the stages behind it wait as well.
 """
 
+import dataclasses
 from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -45,6 +46,16 @@ def resolve(config: Config) -> list[Config]:
         begin = stage.at_env_steps
         resolved.append(_apply(stage.set, resolved[-1], name))
     return resolved
+
+
+def begun(config: Config, extra: Mapping[str, Any]) -> int:
+    """How many stages have begun where a checkpoint says that a run stands; those of version 0.1 do not name it."""
+    return int(extra.get("stage", sum(stage.at_env_steps <= extra["env_steps"] for stage in config.stages)))
+
+
+def in_force(config: Config, stage: int) -> Config:
+    """What a policy was trained with last, once `stage` stages of its run have begun; there are none left in it."""
+    return dataclasses.replace(resolve(config)[stage], stages=())
 
 
 class Stages:

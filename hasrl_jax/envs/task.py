@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 
 from hasrl_jax.envs.layout import Entry, size
+from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array, Mirror
 
 
@@ -112,3 +113,24 @@ class Task:
     def env_step_s(self) -> float:
         """Nominal duration of one environment step, seconds."""
         return self.model.opt.timestep * self.steps_per_env_step
+
+
+def require_same_meaning(where: str, before: Task, after: Task) -> None:
+    """Refuses settings under which the numbers of a policy would mean something else.
+
+    Args:
+      where: the settings, for the message.
+      before: the task that the policy was trained for.
+      after: the one that it is to go on with.
+
+    Raises:
+      ConfigError: names the quantities.
+    """
+    tables = {
+        "the policy sees": (before.observation, after.observation),
+        "the actions stand for": (before.action, after.action),
+    }
+    for what, (its, ours) in tables.items():
+        if its != ours:
+            names = ", ".join(sorted({entry.name for entry in set(its) ^ set(ours)}))
+            raise ConfigError(f"{where}: this changes what {what} ({names}); begin another run, with --init-policy")

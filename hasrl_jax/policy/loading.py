@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hasrl_jax.config import tasks
+from hasrl_jax.config import curriculum, tasks
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.compat import upgraded
 from hasrl_jax.config.convert import from_dict, to_dict
@@ -44,7 +44,7 @@ RELEASED_SHA256 = {
 def load_policy_parameters(
     run_dir: str | Path | None, policy: str | Path | None
 ) -> tuple[Config, dict[str, np.ndarray]]:
-    """The configuration a policy was trained with, and its parameters as `ppo.export_parameters` names them.
+    """The configuration a policy was trained with last, and its parameters as `ppo.export_parameters` names them.
 
     Args:
       run_dir: a run directory, whose newest whole checkpoint is taken; or None.
@@ -216,6 +216,7 @@ def _from_run(run_dir: Path) -> tuple[Config, dict[str, np.ndarray]]:
     task = make_task(config)
     template = ppo.init_learner(config, task.observation_size, task.action_size, task.mirror, jax.random.key(0))
     loaded = checkpoint.load(run_dir / CHECKPOINTS_DIRECTORY, template)
+    config = curriculum.in_force(config, curriculum.begun(config, loaded.extra))
     return config, ppo.export_parameters(loaded.learner, config.network.normalize_observations)
 
 

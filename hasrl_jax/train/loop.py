@@ -17,7 +17,7 @@ from hasrl_jax.collect.protocol import Collector, Experience, Networks
 from hasrl_jax.config import curriculum
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.envs.task import Task
+from hasrl_jax.envs.task import Task, require_same_meaning
 from hasrl_jax.errors import CheckpointError, DivergenceError, LearnerError, RunError, WorkerError
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.learn import ppo
@@ -122,11 +122,13 @@ def make_parts(config: Config, make_update: Callable[..., ppo.Update]) -> list[P
     Parts whose learner has the same settings share one update, and so one compiled program.
 
     Raises:
-      ConfigError: the settings do not fit together, or this machine.
+      ConfigError: the settings do not fit together, or this machine, or a stage changes what the parameters mean.
     """
     mesh, parts = ppo.make_mesh(), list[Part]()
-    for part_config in curriculum.resolve(config):
+    for index, part_config in enumerate(curriculum.resolve(config)):
         task = make_task(part_config)
+        if parts:
+            require_same_meaning(f"stages[{index - 1}].set", parts[0].task, task)
         shares_update = parts and parts[-1].config.ppo == part_config.ppo  # stages change nothing else that it reads
         update = parts[-1].update if shares_update else make_update(part_config, *sizes(task), mesh)
         parts.append(Part(part_config, task, update, make_part_collector(part_config, task, mesh)))
@@ -147,9 +149,8 @@ def make_part_collector(config: Config, task: Task, mesh: Mesh) -> Collector:
 
 
 def progress_from(extra: dict[str, Any], config: Config) -> Progress:
-    """Where a checkpoint says that the run stands; those of version 0.1 do not name the stage."""
-    begun = sum(stage.at_env_steps <= extra["env_steps"] for stage in config.stages)
-    return Progress(**{"stage": begun} | extra)
+    """Where a checkpoint says that the run stands."""
+    return Progress(**extra | {"stage": curriculum.begun(config, extra)})
 
 
 def run_iterations(

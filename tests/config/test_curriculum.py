@@ -1,5 +1,6 @@
 """The curriculum: what each stage sets, when it begins, and what is refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ from hasrl_jax.config import curriculum
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.curriculum import WINDOW, Stages
 from hasrl_jax.errors import ConfigError
+from hasrl_jax.learn.ppo import make_update
+from hasrl_jax.train.loop import make_parts
 
 STAGES = [
     {"at_env_steps": 1000, "set": {"cassie.command.start_moving": 0.6}},
@@ -92,6 +95,19 @@ def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
 def test_what_is_refused(stages: list, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         curriculum.resolve(from_dict({"stages": stages}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cassie.action_range_rad": 1.4}, "what the actions stand for (motor_targets"),
+        ({"cassie.command.frame": "heading"}, "what the policy sees ("),
+    ],
+)
+def test_a_stage_may_not_change_what_the_parameters_mean(settings: dict, message: str) -> None:
+    stages = [STAGES[0], {"at_env_steps": 1500, "set": settings}]
+    with pytest.raises(ConfigError, match=rf"^stages\[1\].set: this changes {re.escape(message)}.*; begin another run"):
+        make_parts(from_dict({"stages": stages}), make_update)
 
 
 def test_the_command_line_takes_stages_as_data_and_refuses_before_anything_starts(tmp_path: Path) -> None:

@@ -148,9 +148,20 @@ def test_a_walking_run_goes_on_bit_for_bit(tmp_path):
     assert untimed(broken) == seen
     assert [record["stage"] for record in seen] == [0, 0, 1, 2, 2]
     np.testing.assert_allclose([record["learning_rate"] / 3e-4 for record in seen], [1, 0.8, 0.6, 0.4, 0.2], rtol=1e-6)
-    ours, theirs = (load_policy_parameters(run, None)[1] for run in (whole, broken))
+    (config, ours), (_, theirs) = (load_policy_parameters(run, None) for run in (whole, broken))
     for name, array in ours.items():
         np.testing.assert_array_equal(array, theirs[name], err_msg=name)
+    # What a policy is played with is what it was trained with last.
+    assert config.settings.command.forward_m_s == (1.0, 2.0)
+    assert config.settings.push.force_n == (100.0, 300.0)
+    assert not config.stages
+    shutil.rmtree(whole / "checkpoints" / "000000005")
+    shutil.rmtree(whole / "checkpoints" / "000000004")
+    settings = load_policy_parameters(whole, None)[0].settings  # of the checkpoint at which the second stage begins
+    assert (settings.command.forward_m_s, settings.push.force_n) == ((1.0, 2.0), (100.0, 300.0))
+    shutil.rmtree(whole / "checkpoints" / "000000003")
+    settings = load_policy_parameters(whole, None)[0].settings
+    assert (settings.command.forward_m_s, settings.push.force_n) == ((1.0, 2.0), (50.0, 150.0))
 
 
 def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
