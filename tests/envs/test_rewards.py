@@ -5,15 +5,17 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hasrl_jax.config.convert import from_dict
-from hasrl_jax.envs.cassie import clock, rewards
+from hasrl_jax.envs.cassie import clock, ids, rewards
 from hasrl_jax.envs.cassie import task as cassie
 from hasrl_jax.envs.cassie.settings import RewardConfig
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.task import Reading, Task
 
 PAPER = RewardConfig(lateral_velocity_share=0.0, follow_lateral_command=False)
+WEIGHTS = rewards.weights(PAPER)
 
 
 def _errors(**changes: float) -> dict[str, np.ndarray]:
@@ -45,23 +47,23 @@ def test_quaternion_error_is_the_squared_sine_of_half_the_angle() -> None:
 )
 def test_pelvis_motion_bands(lateral: float, height: float, speed: float, expected: float) -> None:
     still = np.zeros(3)
-    value = rewards.pelvis_motion(np.array(lateral), np.array(height - 0.9), np.array(speed), still, still, PAPER, np)
+    value = rewards.pelvis_motion(np.array(lateral), np.array(height - 0.9), np.array(speed), still, still, PAPER)
     assert value == pytest.approx(expected)
 
 
 def test_pelvis_motion_counts_shaking() -> None:
     angular, linear = np.array([1.0, -2.0, 0.5]), np.array([-0.5, 0.0, 4.0])
-    value = rewards.pelvis_motion(np.array(0.0), np.array(0.0), np.array(0.0), angular, linear, PAPER, np)
+    value = rewards.pelvis_motion(np.array(0.0), np.array(0.0), np.array(0.0), angular, linear, PAPER)
     assert value == pytest.approx(0.25 * (3.5 + 4.5))
 
 
 def test_weights_of_the_paper() -> None:
-    terms = rewards.weighted_terms(_errors(), PAPER, np)
+    terms = rewards.weighted_terms(_errors(), WEIGHTS, np)
     np.testing.assert_allclose(terms, [0, 0, 0.4, 0.3, 0.3, 0.1, 0.05, 0.05, 0])  # no error, no clock score
     best = math.tan(0.3 * math.pi)  # one foot at its limit, as its clock asks
-    terms = rewards.weighted_terms(_errors(foot_force=best, foot_velocity=best), PAPER, np)
+    terms = rewards.weighted_terms(_errors(foot_force=best, foot_velocity=best), WEIGHTS, np)
     assert terms.sum() == pytest.approx(2 * (0.4 * best + 0.6))
-    worse = rewards.weighted_terms(_errors(velocity=1.0, hip_roll=2.0), PAPER, np)
+    worse = rewards.weighted_terms(_errors(velocity=1.0, hip_roll=2.0), WEIGHTS, np)
     assert worse[4] == pytest.approx(0.3 * math.exp(-1))
     assert worse[5] == pytest.approx(0.1 * math.exp(-2))
 
@@ -80,7 +82,8 @@ def _step(constants: cassie.Constants, task: Task, **changes: np.ndarray):
     sensors = np.zeros((1, task.model.nsensordata))
     sensors[0, ids.acceleration] = 0, 0, 9.81 + 1.0
     sensors[0, ids.torque] = 4.0
-    sensors[0, ids.foot_velocity[0]] = 0.6, 0.8, 0.0
+    at = task.model.sensor("left-foot-velocity").adr[0]
+    sensors[0, at : at + 3] = 0.6, 0.8, 0.0
     reading = Reading(qpos, qvel, sensors, np.array([[175.0, 350.0, 0.01, 0.02, 60.0]]))
     return task.step(state, np.full((1, 10), 0.1), reading, np.full((1, task.step_uniforms), 0.5), np), state
 
@@ -141,3 +144,20 @@ def test_zero_action_changes_nothing_and_terms_sum_to_the_reward() -> None:
         np.testing.assert_allclose(result.reward_terms.sum(axis=1), result.reward)
         assert (result.reward_terms[:, 2:] >= 0).all()
         assert (result.reward_terms[:, 2:] <= [0.4, 0.3, 0.3, 0.1, 0.05, 0.05, 0]).all()
+
+
+def test_how_steeply_a_foot_points_up() -> None:
+    quats = Rotation.random(5, random_state=2).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    for quat in [rewards.NEUTRAL_FOOT_QUAT, *quats]:
+        neutral, turned = (Rotation.from_quat(q[[1, 2, 3, 0]]) for q in (rewards.NEUTRAL_FOOT_QUAT, quat))
+        ahead = turned.apply(neutral.inv().apply([1.0, 0.0, 0.0]))
+        assert rewards.toe_up(quat, np) == pytest.approx(ahead[2], abs=1e-7)
+
+
+def test_rows_that_stand_evenly_are_read_without_copying() -> None:
+    values = np.arange(24.0).reshape(2, 12)
+    even = np.array([[1, 2, 3], [6, 7, 8]])
+    for size, indices in ((12, even), (10, even), (12, even[::-1]), (12, np.array([[0, 1, 2], [4, 5, 7]]))):
+        place = ids.in_rows(indices, size)
+        np.testing.assert_array_equal(ids.at(values[:, :size], place), values[:, :size][:, indices])
+    assert np.shares_memory(ids.at(values, ids.in_rows(even, 12)), values)
