@@ -97,10 +97,13 @@ class CpuEnvs:
         self._fields: dict[str, np.ndarray] = {}  # randomised field -> its values [E, ...] in the batch
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
         self._physics = self._batch.state[self._all, :size]
+        nq, nv = task.model.nq, task.model.nv
+        self._qpos, self._qvel = slice(1, 1 + nq), slice(1 + nq, 1 + nq + nv)  # in the physics state
         self._warm_start = self._batch.bind("qacc_warmstart")
         self._inputs = self._batch.bind("ctrl")
         self._applied = self._batch.bind("qfrc_applied")
         self._warnings = self._batch.warning[..., 1]  # [E, warnings] how often each was given
+        self._none = np.zeros(self._shape, bool)
         self._late = [task.model.sensor(name).id for name in task.end_sensors]
         steps = task.steps_per_env_step
         split = bool(self._late) and steps > 1 and self.num_envs >= SPLIT_FROM
@@ -143,10 +146,12 @@ class CpuEnvs:
         if not np.isfinite(action).all():
             raise DivergenceError("the policy produced an action that is not finite")
         task = self.task
-        physics, reading, failed = self._simulate(state, self._control(state, action))
+        physics, reading, warned = self._simulate(state, self._control(state, action))
         result = task.step(state.task, action, reading, rng.random((*self._shape, task.step_uniforms)), np)
         # Nor may what the task makes of a good simulation spoil a whole batch, or the statistics of the observations.
-        diverged = failed | ~np.isfinite(summed(result.observation, np) + result.reward)
+        # A sum is finite where all its numbers are.
+        checked = summed(physics, np) + summed(reading.sensordata, np) + summed(result.observation, np) + result.reward
+        diverged = warned | ~np.isfinite(checked)
         episode_step = state.episode_step + 1
         terminated = result.terminated & ~diverged
         truncated = (episode_step >= self.max_episode_steps) & ~(terminated | diverged)
@@ -210,9 +215,9 @@ class CpuEnvs:
         """Runs the physics steps of one environment step under `control`, [E, S or 1, nu].
 
         Returns:
-          The physics state, what the task reads of it, and which simulations diverged, [E] bool.
+          The physics state, what the task reads of it, and which simulations MuJoCo gave up, [E] bool.
         """
-        task, model = self.task, self.task.model
+        task = self.task
         if task.pace:
             self._field("timestep")[:] = self._physics_step_s(state)
         if self._force:
@@ -225,20 +230,14 @@ class CpuEnvs:
             self.physics_seconds += time.thread_time() - cpu
         sensed = [record["sensordata"][self._all] for record in self._records]  # [E, S, nsensordata] each
         end, sensordata = self._physics.copy(), sensed[-1][..., -1, :].copy()
-        # A sum is finite where all its numbers are.
-        diverged = ~np.isfinite(summed(end, np) + summed(sensordata, np))
         # MuJoCo resets a simulation that went bad to a finite state, and counts it.
+        warned = self._none
         if np.count_nonzero(self._warnings):
-            diverged = diverged | self._warnings[self._all][..., _BAD].any(axis=-1)
+            warned = self._warnings[self._all][..., _BAD].any(axis=-1)
             self._warnings[:] = 0
-        features = [np.add.reduce(task.physics_features(part, np), axis=-2) for part in sensed]
-        reading = Reading(
-            qpos=end[..., 1 : 1 + model.nq],
-            qvel=end[..., 1 + model.nq : 1 + model.nq + model.nv],
-            sensordata=sensordata,
-            averages=sum(features[1:], features[0]) / task.steps_per_env_step,
-        )
-        return end, reading, diverged
+        features, *more = [np.add.reduce(task.physics_features(part, np), axis=-2) for part in sensed]
+        averages = sum(more, features) / task.steps_per_env_step
+        return end, Reading(end[..., self._qpos], end[..., self._qvel], sensordata, averages), warned
 
     def _run(self, control: np.ndarray) -> None:
         """All physics steps under `control`, [E, S or 1, nu]; sensors that only the last one needs wait for it."""

@@ -31,7 +31,7 @@ def test_clock_score() -> None:
 
 def test_quaternion_error_is_the_squared_sine_of_half_the_angle() -> None:
     quat = np.array([[math.cos(0.2), 0, math.sin(0.2), 0], [-1, 0, 0, 0]])
-    error = rewards.quaternion_error(quat, np.array([1.0, 0, 0, 0]))
+    error = rewards.quaternion_error(quat, np.array([1.0, 0, 0, 0]), np)
     np.testing.assert_allclose(error, [math.sin(0.2) ** 2, 0], atol=1e-12)
 
 

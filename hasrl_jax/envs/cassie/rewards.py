@@ -61,9 +61,9 @@ def toe_up(quat: Array, xp: Any) -> Array:
     return summed(products.reshape((*quat.shape[:-1], TOE_UP.size)), xp)
 
 
-def quaternion_error(quat: Array, reference: Array) -> Array:
+def quaternion_error(quat: Array, reference: Array, xp: Any) -> Array:
     """1 - <reference, quat>^2, the squared sine of half the angle between them: [..., 4] -> [...]."""
-    return 1.0 - total(quat * reference) ** 2
+    return 1.0 - summed(quat * reference, xp) ** 2
 
 
 def turned_quaternion_error(products: Array, angle: Array, xp: Any) -> Array:

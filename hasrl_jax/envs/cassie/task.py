@@ -512,7 +512,7 @@ def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
     ids = constants.ids
     quat = at(sensordata, ids.foot_orientation)
     if constants.config.command.frame == "world":
-        error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT)
+        error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT, xp)
     else:
         error = rewards.turn_products(quat, rewards.NEUTRAL_FOOT_QUAT, xp).reshape((*quat.shape[:-2], 6))
     power = layout.summed(abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]), xp)
