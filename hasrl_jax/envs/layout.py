@@ -34,7 +34,9 @@ class Entry(NamedTuple):
 
 def numbers(vector: Array) -> list[Array]:
     """The numbers of a vector [..., n], each [...]; those of a lone one are scalars, which NumPy handles fastest."""
-    return list(vector) if vector.ndim == 1 else [vector[..., index] for index in range(vector.shape[-1])]
+    # Not by iterating over the vector: that ends with an error, which takes longer than they do.
+    places = range(vector.shape[-1])
+    return [vector[index] for index in places] if vector.ndim == 1 else [vector[..., index] for index in places]
 
 
 def total(vector: Array) -> Array:
