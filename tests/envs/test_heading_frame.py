@@ -13,7 +13,6 @@ from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout
 from hasrl_jax.envs.cassie import commands, rewards
 from hasrl_jax.envs.cassie import task as cassie
-from hasrl_jax.envs.cassie.ids import SIDES
 from hasrl_jax.envs.cpu_engine import CpuEnvs, EnvState
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.envs.task import Reading, Task
@@ -88,11 +87,8 @@ def _turned_world(constants: cassie.Constants, reading: Reading, angle: float) -
     for robot in range(2):
         qpos[robot, :2], qvel[robot, :2] = rotation @ qpos[robot, :2], rotation @ qvel[robot, :2]
         qpos[robot, 3:7] = _turned_quat(qpos[robot, 3:7], angle)
-        for side in SIDES:
-            at, along = (
-                constants.model.sensor(f"{side}-foot-{name}").adr[0] + np.arange(count)
-                for name, count in (("orientation", 4), ("velocity", 2))
-            )
+        for foot in range(2):
+            at, along = constants.ids.foot_orientation[foot], constants.ids.foot_velocity[foot][:2]
             sensors[robot, at] = _turned_quat(sensors[robot, at], angle)
             sensors[robot, along] = rotation @ sensors[robot, along]
     features = cassie.physics_features(constants, sensors, np)

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from hasrl_jax.types import Array
-
 MOTORS = ("hip-roll", "hip-yaw", "hip-pitch", "knee", "foot")  # per leg, left leg first
 PASSIVE_JOINTS = ("shin", "tarsus", "foot")  # per leg, left leg first
 SIDES = ("left", "right")
@@ -18,30 +16,6 @@ NO_NAMES: Mapping[str, str] = MappingProxyType({})  # everything is called as in
 
 
 Place = np.ndarray | slice
-
-
-class Rows(NamedTuple):
-    """Places [R, n] of which every row stands equally far behind the one before it, so that nothing is copied."""
-
-    start: int
-    rows: int
-    pitch: int  # from one row to the next
-    length: int  # n
-
-
-def at(values: Array, place: np.ndarray | Rows) -> Array:
-    """The numbers at the places [R, n] of a vector, [..., N] -> [..., R, n]."""
-    if not isinstance(place, Rows):
-        return values[..., place]
-    block = values[..., place.start : place.start + place.rows * place.pitch]
-    return block.reshape((*values.shape[:-1], place.rows, place.pitch))[..., : place.length]
-
-
-def in_rows(indices: np.ndarray, size: int) -> np.ndarray | Rows:
-    """The same places [R, n] in a vector of `size` as `Rows` if they are such."""
-    (rows, length), start, pitch = indices.shape, int(indices[0, 0]), int(indices[1, 0] - indices[0, 0])
-    same = np.array_equal(indices, start + pitch * np.arange(rows)[:, None] + np.arange(length))
-    return Rows(start, rows, pitch, length) if same and length <= pitch and start + rows * pitch <= size else indices
 
 
 class CassieIds(NamedTuple):
@@ -56,8 +30,8 @@ class CassieIds(NamedTuple):
     hip_roll_qvel: Place  # [2]
     acceleration: Place  # [3] in sensordata
     foot_force: Place  # [2]
-    foot_orientation: np.ndarray | Rows  # [2, 4]
-    foot_velocity: np.ndarray | Rows  # [2, 3]
+    foot_orientation: np.ndarray  # [2, 4]
+    foot_velocity: np.ndarray  # [2, 3]
     torque: Place  # [10]
     motor_speed: Place  # [10]
 
@@ -100,8 +74,8 @@ def cassie_ids(
         hip_roll_qvel=evenly_spaced(np.array([motors[0].dofadr[0], motors[5].dofadr[0]])),
         acceleration=evenly_spaced(places("pelvis-acceleration")[0]),
         foot_force=evenly_spaced(places("left-foot-force", "right-foot-force")[:, 0]),
-        foot_orientation=in_rows(places("left-foot-orientation", "right-foot-orientation"), model.nsensordata),
-        foot_velocity=in_rows(places("left-foot-velocity", "right-foot-velocity"), model.nsensordata),
+        foot_orientation=places("left-foot-orientation", "right-foot-orientation"),
+        foot_velocity=places("left-foot-velocity", "right-foot-velocity"),
         torque=evenly_spaced(places(*(f"{side}-{name}-torque" for side in SIDES for name in MOTORS))[:, 0]),
         motor_speed=evenly_spaced(places(*(f"{side}-{name}-speed" for side in SIDES for name in MOTORS))[:, 0]),
     )

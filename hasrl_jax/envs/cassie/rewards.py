@@ -32,16 +32,7 @@ CLOCK_GAIN = 1.2
 # World orientation (w, x, y, z) of a foot body that stands flat and points ahead.
 NEUTRAL_FOOT_QUAT = np.array([-0.24790886, -0.24679713, -0.66093967, 0.66392102])
 _W, _X, _Y, _Z = NEUTRAL_FOOT_QUAT
-_TOE = 1 - 2 * (_Y**2 + _Z**2), 2 * (_X * _Y - _W * _Z), 2 * (_X * _Z + _W * _Y)  # ahead, in the frame of the foot
-# <up, toe> = sum_ij A_ij q_i q_j: how steeply a foot with the orientation q points up, as the sine of the angle.
-TOE_UP = np.array(
-    [
-        [_TOE[2], _TOE[1], -_TOE[0], 0.0],
-        [_TOE[1], -_TOE[2], 0.0, _TOE[0]],
-        [-_TOE[0], 0.0, -_TOE[2], _TOE[1]],
-        [0.0, _TOE[0], _TOE[1], _TOE[2]],
-    ]
-)
+TOE_AXIS = np.array([1 - 2 * (_Y**2 + _Z**2), 2 * (_X * _Y - _W * _Z), 2 * (_X * _Z + _W * _Y)])  # ahead, in its frame
 
 
 def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -> Array:
@@ -53,12 +44,6 @@ def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -
     """
     share = xp.minimum(magnitude, limit) / limit
     return total(xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share))
-
-
-def toe_up(quat: Array, xp: Any) -> Array:
-    """How steeply a foot points up, as the sine of the angle, [..., 4] -> [...]."""
-    products = quat[..., :, None] * quat[..., None, :] * TOE_UP
-    return summed(products.reshape((*quat.shape[:-1], TOE_UP.size)), xp)
 
 
 def quaternion_error(quat: Array, reference: Array, xp: Any) -> Array:

@@ -16,7 +16,7 @@ from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs import frames, layout, motors
 from hasrl_jax.envs.cassie import clock, commands, gaits, kinematics, other_model, randomize, rewards, terrain, tracking
-from hasrl_jax.envs.cassie.ids import MOTOR_SIGNS, MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, at, cassie_ids
+from hasrl_jax.envs.cassie.ids import MOTOR_SIGNS, MOTORS, PASSIVE_JOINTS, SIDES, CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.other_model import Names
 from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
 from hasrl_jax.envs.draws import between
@@ -510,7 +510,7 @@ def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
     PD loop has calmed down, it would be up to a fifth too low.
     """
     ids = constants.ids
-    quat = at(sensordata, ids.foot_orientation)
+    quat = sensordata[..., ids.foot_orientation]
     if constants.config.command.frame == "world":
         error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT, xp)
     else:
@@ -622,8 +622,8 @@ def observe(
 def toe_force(constants: Constants, sensordata: Array, xp: Any) -> Array:
     """Ground force on each foot while it points down and so stands on its toe, else 0, N, [..., 2]."""
     ids = constants.ids
-    quat = at(sensordata, ids.foot_orientation)
-    return xp.where(rewards.toe_up(quat, xp) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
+    up = frames.up_in_body_frame(sensordata[..., ids.foot_orientation], xp)
+    return xp.where(layout.total(up * rewards.TOE_AXIS) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
 
 
 def with_command(
@@ -808,7 +808,7 @@ def reward_errors(
         standing = state.standing[..., None]
         force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
         most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
-    foot_speed = xp.sqrt(layout.total(at(reading.sensordata, ids.foot_velocity) ** 2))
+    foot_speed = xp.sqrt(layout.total(reading.sensordata[..., ids.foot_velocity] ** 2))
     w = layout.numbers(motion.orientation)[0]
     pelvis_error = 1.0 - w * w  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     forward_error, lateral_error = abs(motion.forward - speed), abs(motion.lateral - told["lateral"])
