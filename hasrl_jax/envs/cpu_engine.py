@@ -1,4 +1,7 @@
-"""Many environments stepped together by C MuJoCo in one call; the engine behind the CPU pool.
+"""Many environments stepped together by C MuJoCo in one call, or a lone one; the engine behind the CPU pool.
+
+Shapes begin with the number of environments, written E. A lone environment has arrays without that axis: NumPy takes
+as long for an array of one number as for one of fifty, and a fraction of that for a scalar.
 
 Every number that describes the environments is an array in `EnvState`, so saving and restoring them
 is copying arrays. Randomness comes in as a NumPy generator; the environments hold none.
@@ -11,14 +14,15 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from hasrl_jax.envs.draws import anywhere
+from hasrl_jax.envs.layout import summed
 from hasrl_jax.envs.model import without_islands
 from hasrl_jax.envs.task import Reading, Reset, Task
 from hasrl_jax.errors import DivergenceError
 from hasrl_jax.types import Array
 
 PHYSICS_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-CONTROL = mujoco.mjtState.mjSTATE_CTRL.value
-FORCE = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value
+RECORD = ("sensordata",)
 SPLIT_FROM = 8  # environments from which sensors left out save more than the second call that this takes
 
 # Warnings of a simulation that went bad; a full buffer of contacts is none.
@@ -66,49 +70,59 @@ class CpuEnvs:
 
     Args:
       task: the definition to run.
-      num_envs: E.
+      num_envs: E; None for a lone environment, whose arrays lack that axis.
       max_episode_steps: time limit in environment steps.
       pushable: whether `Task.with_push` may be used on a task that is not disturbed by itself.
       timed: whether `physics_seconds` is counted.
     """
 
-    def __init__(self, task: Task, num_envs: int, max_episode_steps: int, pushable: bool = False, timed: bool = False):
+    def __init__(
+        self, task: Task, num_envs: int | None, max_episode_steps: int, pushable: bool = False, timed: bool = False
+    ):
         # `step` reports a diverged simulation; MuJoCo would also write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda text: None)
         self.task = task
         self.max_episode_steps = max_episode_steps
-        self.num_envs = num_envs
+        self.num_envs = num_envs or 1
+        self._shape = () if num_envs is None else (num_envs,)
+        self._all: Any = 0 if num_envs is None else slice(None)  # the environments in an array of the batch
         self._timestep = task.model.opt.timestep
         self._timed = timed
         self.physics_seconds = 0.0  # CPU time spent inside MuJoCo so far
         self._prepared: Reset | None = None  # E fresh episodes
         self._taken = 0  # of the prepared episodes
         self._source: Any = None  # the generator that drew them
-        self._batch = Batch(without_islands(task.model), num_envs, nthread=1)  # on the calling thread: a core a worker
+        # On the calling thread: a core a worker.
+        self._batch = Batch(without_islands(task.model), self.num_envs, nthread=1)
         self._fields: dict[str, np.ndarray] = {}  # randomised field -> its values [E, ...] in the batch
         size = mujoco.mj_stateSize(task.model, PHYSICS_STATE)
-        self._physics = self._batch.state[:, :size]
+        self._physics = self._batch.state[self._all, :size]
+        nq, nv = task.model.nq, task.model.nv
+        self._qpos, self._qvel = slice(1, 1 + nq), slice(1 + nq, 1 + nq + nv)  # in the physics state
         self._warm_start = self._batch.bind("qacc_warmstart")
+        self._inputs = self._batch.bind("ctrl")
+        self._applied = self._batch.bind("qfrc_applied")
+        self._warnings = self._batch.warning[..., 1]  # [E, warnings] how often each was given
+        self._none = np.zeros(self._shape, bool)
         self._late = [task.model.sensor(name).id for name in task.end_sensors]
         steps = task.steps_per_env_step
-        split = bool(self._late) and steps > 1 and num_envs >= SPLIT_FROM
+        split = bool(self._late) and steps > 1 and self.num_envs >= SPLIT_FROM
         self._parts = (steps - 1, 1) if split else (steps,)  # physics steps of each call
         self._stages = self._batch.expand("sensor_needstage") if split else None  # [E, sensors]
         self._records: list[dict[Any, np.ndarray]] = [{} for _ in self._parts]
         self._force = task.force if task.disturbed or pushable else None
-        self._control_spec = CONTROL | FORCE if self._force else CONTROL
 
     def reset(self, rng: np.random.Generator) -> EnvState:
         """Fresh episodes in all environments."""
-        fresh = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
+        fresh = self._fresh(rng)
         state = EnvState(
             physics=_physics(fresh, self.task.model.na),
             task=fresh.state,
             model_fields=fresh.model_fields,
             observation=fresh.observation,
-            is_first=np.ones(self.num_envs, bool),
-            episode_step=np.zeros(self.num_envs, np.int64),
-            episode_return=np.zeros(self.num_envs),
+            is_first=np.ones(self._shape, bool),
+            episode_step=np.zeros(self._shape, np.int64),
+            episode_return=np.zeros(self._shape),
         )
         self.restore(state)
         return state
@@ -116,7 +130,7 @@ class CpuEnvs:
     def restore(self, state: EnvState) -> None:
         """Writes the randomised fields of `state` into the batch, as `step` expects to find them."""
         self._prepared = None
-        self._write_fields(slice(None), state.model_fields, slice(None))
+        self._write_fields(slice(None), state.model_fields, ...)
 
     def step(self, state: EnvState, action: np.ndarray, rng: np.random.Generator) -> tuple[EnvState, StepResult]:
         """One environment step; environments whose episode ended are reset.
@@ -132,13 +146,15 @@ class CpuEnvs:
         if not np.isfinite(action).all():
             raise DivergenceError("the policy produced an action that is not finite")
         task = self.task
-        physics, reading, diverged = self._simulate(state, self._control(state, action))
-        result = task.step(state.task, action, reading, rng.random((self.num_envs, task.step_uniforms)), np)
+        physics, reading, warned = self._simulate(state, self._control(state, action))
+        result = task.step(state.task, action, reading, rng.random((*self._shape, task.step_uniforms)), np)
         # Nor may what the task makes of a good simulation spoil a whole batch, or the statistics of the observations.
-        diverged |= ~np.isfinite(result.observation.sum(axis=-1) + result.reward)
+        # A sum is finite where all its numbers are.
+        checked = summed(physics, np) + summed(reading.sensordata, np) + summed(result.observation, np) + result.reward
+        diverged = warned | ~np.isfinite(checked)
         episode_step = state.episode_step + 1
         terminated = result.terminated & ~diverged
-        truncated = (episode_step >= self.max_episode_steps) & ~terminated & ~diverged
+        truncated = (episode_step >= self.max_episode_steps) & ~(terminated | diverged)
         step_result = StepResult(
             result.reward, terminated, truncated, diverged, result.observation, result.reward_terms, result.measures
         )
@@ -147,23 +163,25 @@ class CpuEnvs:
             task=result.state,
             model_fields=state.model_fields,
             observation=result.observation,
-            is_first=np.zeros(self.num_envs, bool),
+            is_first=np.zeros(self._shape, bool),
             episode_step=episode_step,
             episode_return=state.episode_return + result.reward,
         )
         ended = terminated | truncated | diverged
-        return (self._reset_some(state, np.flatnonzero(ended), rng) if ended.any() else state), step_result
+        if not anywhere(ended):
+            return state, step_result
+        return self._reset_some(state, np.flatnonzero(ended), rng) if self._shape else self.reset(rng), step_result
 
     def _control(self, state: EnvState, action: np.ndarray) -> np.ndarray:
         """Controls of the physics steps of an environment step, [E, S, nu], or [E, 1, nu] where all are the same."""
         task = self.task
-        control = task.control(state.task, action, np)[:, None]
+        control = task.control(state.task, action, np)[..., None, :]
         if task.delay is None:
             return control
         earlier, delay_s = task.delay(state.task, np)
         delay_steps = delay_s / self._physics_step_s(state)
-        late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[:, None]
-        return np.where(late[..., None], task.control(state.task, earlier, np)[:, None], control)
+        late = np.arange(task.steps_per_env_step) + 0.5 < delay_steps[..., None]
+        return np.where(late[..., None], task.control(state.task, earlier, np)[..., None, :], control)
 
     def _physics_step_s(self, state: EnvState) -> np.ndarray | float:
         """Physics step within the coming environment step, s, [E] or the same for all."""
@@ -197,52 +215,51 @@ class CpuEnvs:
         """Runs the physics steps of one environment step under `control`, [E, S or 1, nu].
 
         Returns:
-          The physics state, what the task reads of it, and which simulations diverged, [E] bool.
+          The physics state, what the task reads of it, and which simulations MuJoCo gave up, [E] bool.
         """
-        task, model = self.task, self.task.model
+        task = self.task
         if task.pace:
             self._field("timestep")[:] = self._physics_step_s(state)
         if self._force:
-            applied = np.repeat(self._force(state.task, np)[:, None], control.shape[1], axis=1)
-            control = np.concatenate([control, applied], axis=2)
+            self._applied[:] = self._force(state.task, np)
         self._physics[:] = state.physics
         self._warm_start[:] = 0.0  # what is simulated depends on the state alone
         cpu = time.thread_time() if self._timed else 0.0  # MuJoCo runs on this thread
         self._run(control)
         if self._timed:
             self.physics_seconds += time.thread_time() - cpu
-        end, sensordata = self._physics.copy(), self._records[-1]["sensordata"][:, -1].copy()
+        sensed = [record["sensordata"][self._all] for record in self._records]  # [E, S, nsensordata] each
+        end, sensordata = self._physics.copy(), sensed[-1][..., -1, :].copy()
         # MuJoCo resets a simulation that went bad to a finite state, and counts it.
-        warnings = self._batch.warning[:, :, 1]
-        warned = warnings[:, _BAD].any(axis=1)
-        if warned.any():
-            warnings[:] = 0
-        # A sum is finite where all its numbers are.
-        diverged = warned | ~np.isfinite(end.sum(axis=1) + sensordata.sum(axis=1))
-        features = [task.physics_features(record["sensordata"], np).sum(axis=1) for record in self._records]
-        reading = Reading(
-            qpos=end[:, 1 : 1 + model.nq],
-            qvel=end[:, 1 + model.nq : 1 + model.nq + model.nv],
-            sensordata=sensordata,
-            averages=sum(features) / task.steps_per_env_step,
-        )
-        return end, reading, diverged
+        warned = self._none
+        if np.count_nonzero(self._warnings):
+            warned = self._warnings[self._all][..., _BAD].any(axis=-1)
+            self._warnings[:] = 0
+        features, *more = [np.add.reduce(task.physics_features(part, np), axis=-2) for part in sensed]
+        averages = sum(more, features) / task.steps_per_env_step
+        return end, Reading(end[..., self._qpos], end[..., self._qvel], sensordata, averages), warned
 
     def _run(self, control: np.ndarray) -> None:
-        """All physics steps under `control`, [E, S or 1, inputs]; sensors that only the last one needs wait for it."""
-        first = 0
+        """All physics steps under `control`, [E, S or 1, nu]; sensors that only the last one needs wait for it."""
+        first, held = 0, control.shape[-2] == 1
+        if held:
+            self._inputs[:] = control[..., 0, :]
         for steps, record in zip(self._parts, self._records, strict=True):
             if self._stages is not None:
                 late = self.task.model.sensor_needstage[self._late] if first else mujoco.mjtStage.mjSTAGE_NONE.value
                 self._stages[:, self._late] = late
-            part = control if control.shape[1] == 1 else control[:, first : first + steps]
-            record |= self._batch.rollout(steps, part, self._control_spec, ["sensordata"], out=record)
+            part = None if held else control[..., first : first + steps, :]
+            record |= self._batch.rollout(steps, part, record=RECORD, out=record)
             first += steps
+
+    def _fresh(self, rng: np.random.Generator) -> Reset:
+        """An episode for every environment."""
+        return self.task.reset(rng.random((*self._shape, self.task.reset_uniforms)), np)
 
     def _reset_some(self, state: EnvState, envs: np.ndarray, rng: np.random.Generator) -> EnvState:
         """`state` with fresh episodes in the environments numbered `envs`; takes over its arrays where it owns them."""
         if self._prepared is None or self._source is not rng or self._taken + len(envs) > self.num_envs:
-            self._prepared = self.task.reset(rng.random((self.num_envs, self.task.reset_uniforms)), np)
+            self._prepared = self._fresh(rng)
             self._taken, self._source = 0, rng
         fresh, rows = self._prepared, slice(self._taken, self._taken + len(envs))
         self._taken = rows.stop
@@ -264,7 +281,7 @@ class CpuEnvs:
             observation=put(state.observation, fresh.observation),
         )
 
-    def _write_fields(self, envs: np.ndarray | slice, fields: dict[str, np.ndarray], rows: np.ndarray | slice) -> None:
+    def _write_fields(self, envs: np.ndarray | slice, fields: dict[str, np.ndarray], rows: Any) -> None:
         """Rows `rows` of the randomised fields into those of the environments `envs`."""
         for name, values in fields.items():
             self._field(name)[envs] = values[rows]
@@ -278,5 +295,5 @@ class CpuEnvs:
 
 def _physics(fresh: Reset, activations: int) -> np.ndarray:
     """The physics state of fresh episodes, [E, nstate]: time, qpos, qvel, and what lags in actuators at rest."""
-    num_envs = len(fresh.qpos)
-    return np.concatenate([np.zeros((num_envs, 1)), fresh.qpos, fresh.qvel, np.zeros((num_envs, activations))], axis=1)
+    *shape, _ = fresh.qpos.shape
+    return np.concatenate([np.zeros((*shape, 1)), fresh.qpos, fresh.qvel, np.zeros((*shape, activations))], axis=-1)

@@ -14,6 +14,11 @@ def between(uniform: Array, bounds: tuple[float, float]) -> Array:
     return low + (high - low) * uniform
 
 
+def anywhere(flags: np.ndarray) -> bool:
+    """Whether any of `flags` [...] is set; `any` takes a scalar for an array, slowly."""
+    return bool(flags.any() if flags.ndim else flags)
+
+
 def redrawn(due: Array, draw: Callable[[], tuple[Array, ...]], kept: tuple[Array, ...], xp: Any) -> tuple[Array, ...]:
     """What `draw` returns where it is due, what was kept elsewhere.
 
@@ -25,7 +30,7 @@ def redrawn(due: Array, draw: Callable[[], tuple[Array, ...]], kept: tuple[Array
       draw: returns arrays of the shapes of `kept`.
       kept: arrays [..., *].
     """
-    if xp is np and not due.any():
+    if xp is np and not anywhere(due):
         return kept
     return tuple(
         xp.where(due.reshape(due.shape + (1,) * (old.ndim - due.ndim)), new, old)

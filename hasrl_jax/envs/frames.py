@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from hasrl_jax.envs.layout import columns
+from hasrl_jax.envs.layout import columns, numbers
 from hasrl_jax.types import Array
 
 
 def up_in_body_frame(quat: Array, xp: Any) -> Array:
     """The world's vertical in the frame that `quat` (w, x, y, z) orients, [..., 4] -> [..., 3]."""
-    w, x, y, z = (quat[..., i] for i in range(4))
+    w, x, y, z = numbers(quat)
     return columns([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], xp)
 
 
@@ -26,14 +26,13 @@ def rotated(vector: Array, quat: Array, xp: Any) -> Array:
 
 def cross(a: Array, b: Array, xp: Any) -> Array:
     """a x b, [..., 3]; `numpy.cross` takes several times as long."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    (ax, ay, az), (bx, by, bz) = numbers(a), numbers(b)
     return columns([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], xp)
 
 
 def heading(quat: Array, xp: Any) -> Array:
     """Yaw angle, [..., 4] -> [...]."""
-    w, x, y, z = (quat[..., i] for i in range(4))
+    w, x, y, z = numbers(quat)
     return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
@@ -44,7 +43,7 @@ def wrapped(angle: Array, xp: Any) -> Array:
 
 def turned(vector: Array, angle: Array, xp: Any) -> Array:
     """A vector whose first two numbers are horizontal, turned by `angle`: [..., n], [...] -> [..., n]."""
-    cos, sin, x, y = xp.cos(angle), xp.sin(angle), vector[..., 0], vector[..., 1]
+    cos, sin, (x, y) = xp.cos(angle), xp.sin(angle), numbers(vector[..., :2])
     horizontal = columns([cos * x - sin * y, sin * x + cos * y], xp)
     return xp.concatenate([horizontal, vector[..., 2:]], axis=-1)
 
@@ -52,6 +51,6 @@ def turned(vector: Array, angle: Array, xp: Any) -> Array:
 def turned_quaternion(quat: Array, angle: Array, xp: Any) -> Array:
     """An orientation (w, x, y, z) turned by `angle`, with w >= 0: [..., 4], [...] -> [..., 4]."""
     cos, sin = xp.cos(angle / 2), xp.sin(angle / 2)
-    w, x, y, z = (quat[..., i] for i in range(4))
+    w, x, y, z = numbers(quat)
     result = columns([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], xp)
     return xp.where(result[..., :1] < 0, -result, result)

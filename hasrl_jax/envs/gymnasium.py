@@ -1,6 +1,6 @@
 """One environment behind the gymnasium interface: `gymnasium.make("hasrl_jax/Cassie-v0")`.
 
-It is the collectors' own `CpuEnvs` with a single environment, so what is true of one is true of the other.
+It is the collectors' own `CpuEnvs` with a lone environment, so what is true of one is true of the other.
 """
 
 import weakref
@@ -106,11 +106,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         command = commanded(self.task, options)
         self._state = self._envs.reset(self.np_random)
         self._ended = False
-        self._observation = self._state.observation[0].astype(np.float32)
+        self._observation = self._state.observation
         if command is not None:
             self._tell(command)
         self._shown = self._state
-        return self._observation.copy(), {}
+        return self._seen(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One environment step; at an episode's end the observation is still the one it led to.
@@ -124,19 +124,19 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         action = np.asarray(action, np.float64)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action: got shape {action.shape}; expected {self.action_space.shape}")
-        self._state, result = self._envs.step(state, action[None], self.np_random)
-        diverged = bool(result.diverged[0])
-        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0]) or diverged
+        self._state, result = self._envs.step(state, action, self.np_random)
+        diverged = bool(result.diverged)
+        terminated, truncated = bool(result.terminated), bool(result.truncated) or diverged
         self._ended = terminated or truncated
         if not diverged:
-            self._observation = result.final_observation[0].astype(np.float32)
+            self._observation = result.final_observation
         if not self._ended:  # at the end the state is already that of the next episode
             self._shown = self._state
-        values = result.reward_terms[0].tolist() + result.measures[0].tolist()
+        values = result.reward_terms.tolist() + result.measures.tolist()
         info: dict[str, Any] = dict(zip(self._info_names, values, strict=True))
         info["diverged"] = diverged
-        reward = 0.0 if diverged else float(result.reward[0])
-        return self._observation.copy(), reward, terminated, truncated, info
+        reward = 0.0 if diverged else float(result.reward)
+        return self._seen(), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The scene as uint8 [height, width, 3]; after an episode's end, its last pose but one.
@@ -176,7 +176,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._pushable = True
             self._envs = self._engine()
             self._envs.restore(state)
-        force = np.array([[forward_n, lateral_n]], np.float64)
+        force = np.array([forward_n, lateral_n], np.float64)
         self._state = state._replace(task=self.task.with_push(state.task, force, np))
 
     def set_command(self, *told: float, **named: float) -> np.ndarray:
@@ -196,7 +196,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         command = self.check_command(told, **named)
         self._running()
         self._tell(command)
-        return self._observation.copy()
+        return self._seen()
 
     def check_command(self, told: Any, **named: float) -> np.ndarray:
         """A whole command [C] from what is told of it, numbers in order or by name; in force only by `set_command`.
@@ -209,14 +209,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     @property
     def qpos(self) -> np.ndarray:
         """Positions [nq] of the running episode; after its end, those before its last environment step."""
-        return self._shown.physics[0, 1 : 1 + self.task.model.nq]
+        return self._shown.physics[1 : 1 + self.task.model.nq]
 
     @property
     def step_s(self) -> float:
         """Duration of an environment step of this episode, s: a randomised robot has its own."""
         fields = self._state.model_fields if self._state else {}
-        timestep = fields["timestep"][0] if "timestep" in fields else self.task.model.opt.timestep
-        return float(timestep) * self.task.steps_per_env_step
+        return float(fields.get("timestep", self.task.model.opt.timestep)) * self.task.steps_per_env_step
 
     def __getstate__(self) -> dict[str, Any]:
         # What is simulated is arrays, and is copied; the engine and the renderer are made anew.
@@ -237,7 +236,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._info_names = info_names(self.task)
 
     def _engine(self) -> CpuEnvs:
-        return CpuEnvs(self.task, 1, self.config.collect.max_episode_steps, self._pushable)
+        return CpuEnvs(self.task, None, self.config.collect.max_episode_steps, self._pushable)
 
     def _running(self) -> EnvState:
         """The state of the running episode."""
@@ -248,9 +247,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _tell(self, command: np.ndarray) -> None:
         """Puts a whole command [C] in force."""
         assert self.task.with_command is not None and self._state is not None
-        state, observation = self.task.with_command(self._state.task, self._state.observation, command[None], np)
+        state, observation = self.task.with_command(self._state.task, self._state.observation, command, np)
         self._state = self._state._replace(task=state, observation=observation)
-        self._observation = observation[0].astype(np.float32)
+        self._observation = observation
+
+    def _seen(self) -> np.ndarray:
+        """The last observation, float32 [O], an array of the caller's own."""
+        return self._observation.astype(np.float32)
 
 
 def known_render_mode(render_mode: str | None) -> str | None:

@@ -32,8 +32,30 @@ class Entry(NamedTuple):
         return len(self.mirror)
 
 
+def numbers(vector: Array) -> list[Array]:
+    """The numbers of a vector [..., n], each [...]; those of a lone one are scalars, which NumPy handles fastest."""
+    # Not by iterating over the vector: that ends with an error, which takes longer than they do.
+    places = range(vector.shape[-1])
+    return [vector[index] for index in places] if vector.ndim == 1 else [vector[..., index] for index in places]
+
+
+def total(vector: Array) -> Array:
+    """The sum of a vector of few numbers, [..., n] -> [...]: up to seven as `sum` adds them, in half the time."""
+    first, *others = numbers(vector)
+    for other in others:
+        first = first + other
+    return first
+
+
+def summed(vector: Array, xp: Any) -> Array:
+    """The sum of a vector, [..., n] -> [...]: what `sum` gives along the last axis, in two thirds of the time."""
+    return xp.add.reduce(vector, axis=-1)
+
+
 def columns(arrays: Sequence[Array], xp: Any) -> Array:
     """Arrays [...] side by side, [..., n]: what `stack` does along the last axis, in a third of the time."""
+    if xp is np and getattr(arrays[0], "ndim", 0) == 0:
+        return np.array(arrays)
     return xp.concatenate([array[..., None] for array in arrays], axis=-1)
 
 

@@ -27,19 +27,18 @@ def camera_of(task: Task, camera: str | None) -> str | int:
     return camera
 
 
-def place_ground(task: Task, model: mujoco.MjModel, model_fields: dict[str, np.ndarray], env: int = 0) -> None:
+def place_ground(task: Task, model: mujoco.MjModel, model_fields: dict[str, np.ndarray]) -> None:
     """Puts the ground of an episode into `model`, another copy of the task's; level ground stays.
 
     Args:
       task: whose ground it is.
       model: what is changed.
-      model_fields: of the environments, [E, ...].
-      env: the one whose episode it is.
+      model_fields: of the environment whose episode it is.
     """
     ground = model.geom_bodyid == 0  # the first geoms of any model
     for name in ("geom_pos", "geom_size", "geom_quat") if task.ground else ("geom_quat",):
         if name in model_fields:
-            getattr(model, name)[ground] = model_fields[name][env, : ground.sum()]
+            getattr(model, name)[ground] = model_fields[name][: ground.sum()]
             model.geom_sameframe[ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
@@ -80,10 +79,10 @@ class Scene:
                 "Python starts"
             ) from error
 
-    def frame(self, qpos: np.ndarray, model_fields: dict[str, np.ndarray], env: int = 0) -> np.ndarray:
+    def frame(self, qpos: np.ndarray, model_fields: dict[str, np.ndarray]) -> np.ndarray:
         """The robot in a pose [nq] on the ground of an episode, see `place_ground`: uint8 [height, width, 3]."""
         self._data.qpos[:] = qpos
-        place_ground(self._task, self._model, model_fields, env)
+        place_ground(self._task, self._model, model_fields)
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()

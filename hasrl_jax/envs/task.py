@@ -2,7 +2,8 @@
 
 A task never steps physics. An engine (`cpu_engine` or `mjx_engine`) does, and asks the task what to
 apply, what to average over the physics steps, and what it all means. Every function takes `xp`,
-the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, written `...` below.
+the array module (`numpy` or `jax.numpy`), and accepts any leading batch axes, written `...` below; a lone environment
+has none, and MJX maps over them.
 """
 
 from collections.abc import Callable

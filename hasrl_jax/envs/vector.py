@@ -186,7 +186,10 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._scene = Scene(self.task, self.config.physics, *self.frame_size, self._camera, None)
             weakref.finalize(self, self._scene.close)  # also at exit, while OpenGL can still be called
         poses, fields = self._shown.physics[:, 1 : 1 + self.task.model.nq], self._shown.model_fields
-        return tuple(self._scene.frame(pose, fields, env) for env, pose in enumerate(poses))
+        return tuple(
+            self._scene.frame(pose, {name: values[env] for name, values in fields.items()})
+            for env, pose in enumerate(poses)
+        )
 
     def close_extras(self, **_: Any) -> None:
         """Frees the renderer."""

@@ -20,6 +20,7 @@ DISTURBED = {
         "randomize": {"floor_slope_deg": [5, 9], "policy_period_scale": [0.8, 1.3], "torque_lag_s": [0.002, 0.004]},
     }
 }
+FOLLOWING = {"cassie": {"reference": {"gaits": "library", "residual": True}}}  # motor targets about those of a gait
 LAYING = make_task(from_dict({"cassie": {"termination": {"min_height_m": 0.0, "max_tilt_deg": 180.0}}}))  # never ends
 
 
@@ -177,8 +178,8 @@ def test_the_batch_equals_plain_mujoco(num_envs: int, config: dict[str, Any]) ->
     state, _ = envs.step(state, rng.uniform(-0.5, 0.5, (num_envs, 10)), rng)
     assert state.physics[:, 1 + task.model.nq + task.model.nv :].any() == bool(config)  # what lags in actuators
     control = task.control(state.task, rng.uniform(-0.5, 0.5, (num_envs, 10)), np)
-    end, reading, diverged = envs._simulate(state, control[:, None])
-    assert not diverged.any()
+    end, reading, warned = envs._simulate(state, control[:, None])
+    assert not warned.any()
     for env in (0, num_envs - 1):
         model = make_task(from_dict(config)).model
         pace = task.pace(state.task, np)[env] if task.pace else 1.0
@@ -195,6 +196,25 @@ def test_the_batch_equals_plain_mujoco(num_envs: int, config: dict[str, Any]) ->
         np.testing.assert_array_equal(end[env], [data.time, *data.qpos, *data.qvel, *data.act])
         np.testing.assert_array_equal(reading.sensordata[env], data.sensordata)
         np.testing.assert_allclose(reading.averages[env], np.mean(features, axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("config", [{}, DISTURBED, FOLLOWING], ids=["default", "disturbed", "following"])
+def test_a_lone_environment_is_one_of_a_batch(config: dict[str, Any]) -> None:
+    delayed = {"cassie": {"randomize": {"control_delay_s": [0.0, 0.02]}, "push": {"force_n": [0, 100]}}}
+    task = make_task(from_dict(delayed, from_dict(config)))
+    lone, batch = CpuEnvs(task, None, 30), CpuEnvs(task, 1, 30)
+    rngs = [np.random.default_rng(5) for _ in range(2)]
+    ours, theirs = lone.reset(rngs[0]), batch.reset(rngs[1])
+    actions = np.random.default_rng(6).uniform(-1, 1, (70, 10))  # through several falls
+    ended = 0
+    for action in actions:
+        ours, one = lone.step(ours, action, rngs[0])
+        theirs, many = batch.step(theirs, action[None], rngs[1])
+        for a, b in zip([*_leaves(ours), *one], [*_leaves(theirs), *many], strict=True):
+            np.testing.assert_array_equal(a, b[0])
+            assert np.shape(a) == b.shape[1:]
+        ended += int(one.terminated | one.truncated)
+    assert ended > 1
 
 
 def test_prepared_episodes_end_with_their_generator() -> None:

@@ -73,7 +73,7 @@ def test_a_term_is_weighted_and_added_and_a_command_seen_told_and_measured() -> 
     for action in np.random.default_rng(0).uniform(-0.2, 0.2, (5, 10)):
         a, b = ours.step(action), theirs.step(action)
         np.testing.assert_array_equal(ours.qpos, theirs.qpos)
-        qpos, qvel = np.split(ours._state.physics[0, 1:], [35])
+        qpos, qvel = np.split(ours._state.physics[1:], [35])
         term = 0.25 * (np.exp(-abs(qvel[3])) + 0.3)
         assert a[4]["reward/calm"] == pytest.approx(term)
         assert a[1] == pytest.approx(b[1] + term)

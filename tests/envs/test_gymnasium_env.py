@@ -151,10 +151,10 @@ def test_a_randomized_robot_reports_its_step_and_pose() -> None:
     env = make("cassie", from_dict({"cassie": {"randomize": {"enabled": True}}}))
     env.reset(seed=0)
     assert env.step_s != env.task.env_step_s
-    before = env._state.physics[0, 0]
+    before = env._state.physics[0]
     env.step(np.zeros(10))
-    assert env._state.physics[0, 0] - before == pytest.approx(env.step_s)
-    np.testing.assert_array_equal(env.qpos, env._state.physics[0, 1 : 1 + env.task.model.nq])
+    assert env._state.physics[0] - before == pytest.approx(env.step_s)
+    np.testing.assert_array_equal(env.qpos, env._state.physics[1 : 1 + env.task.model.nq])
 
 
 def test_the_time_limit_truncates() -> None:
@@ -168,7 +168,7 @@ def test_a_diverged_simulation_truncates_with_the_last_valid_observation() -> No
     mujoco.set_mju_user_warning(lambda text: None)
     env = make("cassie")
     before, _ = env.reset(seed=0)
-    env._state.physics[0, -1] = np.nan
+    env._state.physics[-1] = np.nan
     observation, reward, terminated, truncated, info = env.step(np.zeros(10, np.float32))
     assert (reward, terminated, truncated, info["diverged"]) == (0.0, False, True, True)
     np.testing.assert_array_equal(observation, before)
@@ -177,7 +177,7 @@ def test_a_diverged_simulation_truncates_with_the_last_valid_observation() -> No
 def momentum(env: TaskEnv) -> np.ndarray:
     """Of the whole robot, N s along the world's axes."""
     model, data = env.task.model, mujoco.MjData(env.task.model)
-    data.qpos[:], data.qvel[:] = np.split(env._state.physics[0, 1:], [model.nq])
+    data.qpos[:], data.qvel[:] = np.split(env._state.physics[1:], [model.nq])
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     return data.subtree_linvel[0] * model.body_mass.sum()
@@ -193,7 +193,7 @@ def test_a_push_is_a_force_on_the_pelvis_for_its_time_as_the_tasks_own() -> None
     plain = make("cassie", from_dict({"cassie": calm}))
     for env in (drawn, asked, plain):
         env.reset(seed=4)
-    force = drawn._state.task.push[0]
+    force = drawn._state.task.push
     assert np.linalg.norm(force) == pytest.approx(size)
     for step in range(22):
         if step == first:

@@ -1,6 +1,10 @@
 """Tables of named quantities: mirror signs against reflected geometry, places by hand."""
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from hasrl_jax.envs import layout
@@ -20,6 +24,18 @@ def test_signs_are_those_of_reflected_geometry() -> None:
     ours, theirs = (rotation.as_quat(canonical=True)[[3, 0, 1, 2]] for rotation in (turned, reflected))
     np.testing.assert_allclose(np.array(layout.QUATERNION) * ours, theirs)
     assert (layout.SAME, layout.NEGATED) == ((1.0,), (-1.0,))
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_parts_and_sums_of_vectors(shape: tuple[int, ...], xp: Any) -> None:
+    values = np.random.default_rng(1).normal(size=(*shape, 5)).astype(np.float32)
+    vector = xp.asarray(values)
+    for index, number in enumerate(layout.numbers(vector)):
+        np.testing.assert_array_equal(number, values[..., index])
+    np.testing.assert_allclose(layout.total(vector), values.sum(axis=-1), rtol=1e-5)
+    np.testing.assert_allclose(layout.summed(vector, xp), values.sum(axis=-1), rtol=1e-5)
+    np.testing.assert_array_equal(layout.columns(layout.numbers(vector), xp), values)
 
 
 def test_places_and_defaults_by_hand() -> None:

@@ -14,6 +14,7 @@ from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.task import Reading, Task
 
 PAPER = RewardConfig(lateral_velocity_share=0.0, follow_lateral_command=False)
+WEIGHTS = rewards.weights(PAPER)
 
 
 def _errors(**changes: float) -> dict[str, np.ndarray]:
@@ -29,7 +30,7 @@ def test_clock_score() -> None:
 
 def test_quaternion_error_is_the_squared_sine_of_half_the_angle() -> None:
     quat = np.array([[math.cos(0.2), 0, math.sin(0.2), 0], [-1, 0, 0, 0]])
-    error = rewards.quaternion_error(quat, np.array([1.0, 0, 0, 0]))
+    error = rewards.quaternion_error(quat, np.array([1.0, 0, 0, 0]), np)
     np.testing.assert_allclose(error, [math.sin(0.2) ** 2, 0], atol=1e-12)
 
 
@@ -45,23 +46,23 @@ def test_quaternion_error_is_the_squared_sine_of_half_the_angle() -> None:
 )
 def test_pelvis_motion_bands(lateral: float, height: float, speed: float, expected: float) -> None:
     still = np.zeros(3)
-    value = rewards.pelvis_motion(np.array(lateral), np.array(height - 0.9), np.array(speed), still, still, PAPER, np)
+    value = rewards.pelvis_motion(np.array(lateral), np.array(height - 0.9), np.array(speed), still, still, PAPER)
     assert value == pytest.approx(expected)
 
 
 def test_pelvis_motion_counts_shaking() -> None:
     angular, linear = np.array([1.0, -2.0, 0.5]), np.array([-0.5, 0.0, 4.0])
-    value = rewards.pelvis_motion(np.array(0.0), np.array(0.0), np.array(0.0), angular, linear, PAPER, np)
+    value = rewards.pelvis_motion(np.array(0.0), np.array(0.0), np.array(0.0), angular, linear, PAPER)
     assert value == pytest.approx(0.25 * (3.5 + 4.5))
 
 
 def test_weights_of_the_paper() -> None:
-    terms = rewards.weighted_terms(_errors(), PAPER, np)
+    terms = rewards.weighted_terms(_errors(), WEIGHTS, np)
     np.testing.assert_allclose(terms, [0, 0, 0.4, 0.3, 0.3, 0.1, 0.05, 0.05, 0])  # no error, no clock score
     best = math.tan(0.3 * math.pi)  # one foot at its limit, as its clock asks
-    terms = rewards.weighted_terms(_errors(foot_force=best, foot_velocity=best), PAPER, np)
+    terms = rewards.weighted_terms(_errors(foot_force=best, foot_velocity=best), WEIGHTS, np)
     assert terms.sum() == pytest.approx(2 * (0.4 * best + 0.6))
-    worse = rewards.weighted_terms(_errors(velocity=1.0, hip_roll=2.0), PAPER, np)
+    worse = rewards.weighted_terms(_errors(velocity=1.0, hip_roll=2.0), WEIGHTS, np)
     assert worse[4] == pytest.approx(0.3 * math.exp(-1))
     assert worse[5] == pytest.approx(0.1 * math.exp(-2))
 

@@ -121,7 +121,7 @@ def test_the_memory_is_kept_from_step_to_step(policy, monkeypatch):
     player = rollout.Player(TaskEnv(config), parameters, seed=0)
     for _ in range(12):
         player.step()
-    observation, is_first, action = (np.stack(parts, axis=1) for parts in zip(*seen, strict=True))
+    observation, is_first, action = (np.stack(parts)[None] for parts in zip(*seen, strict=True))
     np.testing.assert_allclose(action, expected(observation, is_first), atol=1e-5)
 
 

@@ -70,20 +70,20 @@ def test_a_push_is_that_of_the_task_and_ends(live: Live) -> None:
 
     env = live._episode.player.env
     alone, pushed = play(None), play(Push(80.0, 90.0))
-    np.testing.assert_allclose(env._state.task.push[0], [0.0, 0.0], atol=1e-9)  # it is over
+    np.testing.assert_allclose(env._state.task.push, [0.0, 0.0], atol=1e-9)  # it is over
     assert pushed[-1][1] - alone[-1][1] > 0.02  # to the left
     live.advance(Controls(reset=True, push=Push(80.0, 90.0)))
-    np.testing.assert_allclose(live._episode.player.env._state.task.push[0], [0.0, 80.0], atol=1e-9)
+    np.testing.assert_allclose(live._episode.player.env._state.task.push, [0.0, 80.0], atol=1e-9)
 
 
 def test_a_push_to_the_left_is_to_the_left_of_a_robot_that_has_turned(live: Live) -> None:
     live.advance(Controls(reset=True))
     env = live._episode.player.env
     physics = env._state.physics.copy()
-    physics[0, 4:8] = [np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)]  # a quarter to the left: it faces along y
+    physics[4:8] = [np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)]  # a quarter to the left: it faces along y
     env._state = env._shown = env._state._replace(physics=physics)
     live.advance(Controls(push=Push(80.0, 90.0)))
-    np.testing.assert_allclose(env._state.task.push[0], [-80.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(env._state.task.push, [-80.0, 0.0], atol=1e-9)
     assert live.view().push == Push(80.0, pytest.approx(180.0))
 
 

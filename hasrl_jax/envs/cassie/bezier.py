@@ -19,8 +19,9 @@ HALVES, COEFFICIENTS = 2, DEGREE + 1
 
 def bernstein(u: Array, xp: Any) -> Array:
     """The polynomials that weigh the coefficients, [...] -> [..., 6]."""
+    u = u[..., None]  # NumPy rounds powers of a scalar otherwise than those of an array
     terms = [math.comb(DEGREE, k) * u**k * (1 - u) ** (DEGREE - k) for k in range(COEFFICIENTS)]
-    return xp.stack(terms, axis=-1)
+    return xp.concatenate(terms, axis=-1)
 
 
 def value(coefficients: Array, phase: Array, xp: Any) -> Array:

@@ -16,12 +16,12 @@ EDGE = 0.10  # each interval is shortened at both ends by this share of its own 
 
 def cycle_seconds(speed: Array, config: ClockConfig, xp: Any) -> Array:
     """Duration of a gait cycle in seconds at commanded speed(s) [...] in m/s."""
-    return config.cycle_s + config.cycle_per_speed_s * xp.maximum(xp.abs(speed) - config.quicken_above_m_s, 0.0)
+    return config.cycle_s + config.cycle_per_speed_s * xp.maximum(abs(speed) - config.quicken_above_m_s, 0.0)
 
 
 def swing_fraction(speed: Array, config: ClockConfig, xp: Any) -> Array:
     """Share of half a cycle in which a foot swings, at commanded speed(s) [...] in m/s."""
-    share = config.swing_fraction + config.swing_fraction_per_speed * xp.abs(speed)
+    share = config.swing_fraction + config.swing_fraction_per_speed * abs(speed)
     return xp.minimum(xp.maximum(share, 0.05), config.max_swing_fraction)
 
 
@@ -45,13 +45,13 @@ def force_clocks(phase: Array, swing: Array, xp: Any) -> Array:
     edges of different value its slope is zero at both, because the neighbouring segments are flat, so
     it equals the cubic 3u^2 - 2u^3; this closed form needs no spline per episode.
     """
-    own_phase = columns([xp.mod(phase + 0.5, 1.0), phase], xp)
-    swings = _bump(own_phase, swing[..., None], xp)
+    own_phase = columns([(phase + 0.5) % 1.0, phase], xp)
+    swings = _bumps(own_phase, swing, xp)
     return swings[..., ::-1] - swings
 
 
-def _bump(phase: Array, swing: Array, xp: Any) -> Array:
-    """1 while the swing that starts at phase 0 lasts, 0 outside, smooth at both boundaries."""
+def _bumps(phase: Array, swing: Array, xp: Any) -> Array:
+    """1 while the swing that starts at phase 0 lasts, 0 outside, smooth at both boundaries; [..., n], [...]."""
     length = 0.5 * swing  # of the swing, in cycles
     stance = 0.5 - length
     # A transition runs from the inner edge of one interval to the inner edge of the next.
@@ -59,8 +59,10 @@ def _bump(phase: Array, swing: Array, xp: Any) -> Array:
     rise_start = -EDGE * stance
     fall_start = length - EDGE * length
     # The rise straddles the start of the cycle: look at it from the nearest period.
-    centered = xp.where(phase > 0.5 + 0.5 * length, phase - 1.0, phase)
-    return _smoothstep((centered - rise_start) / width, xp) - _smoothstep((centered - fall_start) / width, xp)
+    centered = phase - (phase > (0.5 + 0.5 * length)[..., None])
+    boundaries = columns([rise_start, fall_start], xp)[..., None]
+    passed = _smoothstep((centered[..., None, :] - boundaries) / width[..., None, None], xp)
+    return passed[..., 0, :] - passed[..., 1, :]
 
 
 def _smoothstep(u: Array, xp: Any) -> Array:

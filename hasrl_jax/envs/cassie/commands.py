@@ -8,7 +8,7 @@ import numpy as np
 from hasrl_jax.config.checks import limits_of
 from hasrl_jax.envs.cassie.settings import CommandConfig, PushConfig
 from hasrl_jax.envs.draws import between, redrawn
-from hasrl_jax.envs.layout import NEGATED, SAME, Entry, columns
+from hasrl_jax.envs.layout import NEGATED, SAME, Entry, columns, numbers
 from hasrl_jax.envs.task import Command
 from hasrl_jax.types import Array
 
@@ -32,6 +32,7 @@ YAW_RATE = Told("yaw_rate", "yaw_rate_rad_s", Entry("yaw_rate_command", "rad/s",
 HEIGHT = Told("height", "height_m", Entry("height_command", "m", SAME, mean=0.9, std=0.1), "height", 0.02)
 # In the order of the numbers in a command.
 COMMANDS = {"world": (FORWARD, LATERAL), "heading": (FORWARD, LATERAL, YAW_RATE, HEIGHT)}
+NAMES = {frame: tuple(told.name for told in those) for frame, those in COMMANDS.items()}
 ARROW_KEYS = {"world": ("up-down", "left-right"), "heading": ("up-down", "", "left-right", "")}
 # Places in a command of either frame: both speeds, and in the heading frame the yaw rate behind them.
 PLANAR, MOTION = slice(0, 2), slice(0, 3)
@@ -44,7 +45,7 @@ def num_uniforms(config: CommandConfig) -> int:
 
 def named(command: Array, config: CommandConfig) -> dict[str, Array]:
     """The numbers of a command [..., C] by name, each [...]."""
-    return {entry.name: command[..., index] for index, entry in enumerate(COMMANDS[config.frame])}
+    return dict(zip(NAMES[config.frame], numbers(command), strict=True))
 
 
 def declared(

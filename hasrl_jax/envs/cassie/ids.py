@@ -25,7 +25,9 @@ class CassieIds(NamedTuple):
     motor_qvel: np.ndarray  # [10]
     passive_qpos: np.ndarray  # [6]
     passive_qvel: np.ndarray  # [6]
-    hip_roll_qvel: np.ndarray  # [2]
+    encoder_qpos: np.ndarray  # [16] of the motors and the passive joints
+    encoder_qvel: np.ndarray  # [16]
+    hip_roll_qvel: Place  # [2]
     acceleration: Place  # [3] in sensordata
     foot_force: Place  # [2]
     foot_orientation: np.ndarray  # [2, 4]
@@ -60,13 +62,16 @@ def cassie_ids(
         return np.array([sensor.adr[0] + np.arange(sensor.dim[0]) for sensor in found])
 
     motors, passive = joints_of_both(MOTORS), joints_of_both(PASSIVE_JOINTS)
+    encoders = motors + passive
 
     return CassieIds(
         motor_qpos=np.array([joint.qposadr[0] for joint in motors]),
         motor_qvel=np.array([joint.dofadr[0] for joint in motors]),
         passive_qpos=np.array([joint.qposadr[0] for joint in passive]),
         passive_qvel=np.array([joint.dofadr[0] for joint in passive]),
-        hip_roll_qvel=np.array([motors[0].dofadr[0], motors[5].dofadr[0]]),
+        encoder_qpos=np.array([joint.qposadr[0] for joint in encoders]),
+        encoder_qvel=np.array([joint.dofadr[0] for joint in encoders]),
+        hip_roll_qvel=evenly_spaced(np.array([motors[0].dofadr[0], motors[5].dofadr[0]])),
         acceleration=evenly_spaced(places("pelvis-acceleration")[0]),
         foot_force=evenly_spaced(places("left-foot-force", "right-foot-force")[:, 0]),
         foot_orientation=places("left-foot-orientation", "right-foot-orientation"),

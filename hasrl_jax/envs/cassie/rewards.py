@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hasrl_jax.envs.cassie.settings import RewardConfig
-from hasrl_jax.envs.layout import columns
+from hasrl_jax.envs.layout import columns, summed, total
 from hasrl_jax.types import Array
 
 SCORES = ("foot_force", "foot_velocity")
@@ -43,12 +43,12 @@ def clock_score(clock: Array, magnitude: Array, limit: Array | float, xp: Any) -
       magnitude: ground force (N) or foot speed (m/s), non-negative, [..., 2].
     """
     share = xp.minimum(magnitude, limit) / limit
-    return xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share).sum(axis=-1)
+    return total(xp.tan(xp.pi / 4 * CLOCK_GAIN * clock * share))
 
 
-def quaternion_error(quat: Array, reference: Array) -> Array:
+def quaternion_error(quat: Array, reference: Array, xp: Any) -> Array:
     """1 - <reference, quat>^2, the squared sine of half the angle between them: [..., 4] -> [...]."""
-    return 1.0 - (quat * reference).sum(axis=-1) ** 2
+    return 1.0 - summed(quat * reference, xp) ** 2
 
 
 def turned_quaternion_error(products: Array, angle: Array, xp: Any) -> Array:
@@ -66,14 +66,14 @@ def turned_quaternion_error(products: Array, angle: Array, xp: Any) -> Array:
       [..., n].
     """
     cos, sin = xp.cos(angle / 2), xp.sin(angle / 2)
-    return 1.0 - (products * xp.stack([cos**2, 2 * cos * sin, sin**2], axis=-1)[..., None, :]).sum(axis=-1)
+    return 1.0 - total(products * columns([cos * cos, 2 * cos * sin, sin * sin], xp)[..., None, :])
 
 
 def turn_products(quat: Array, reference: np.ndarray, xp: Any) -> Array:
     """A = a^2, B = a b and C = b^2, [..., 4] -> [..., 3]: a = <reference, quat>, b = <k reference, quat>."""
     w, x, y, z = reference
-    a, b = (quat * reference).sum(axis=-1), (quat * np.array([-z, -y, x, w])).sum(axis=-1)
-    return xp.stack([a * a, a * b, b * b], axis=-1)
+    a, b = total(quat * reference), total(quat * np.array([-z, -y, x, w]))
+    return columns([a * a, a * b, b * b], xp)
 
 
 def pelvis_motion(
@@ -83,7 +83,6 @@ def pelvis_motion(
     angular_velocity: Array,
     acceleration: Array,
     config: RewardConfig,
-    xp: Any,
 ) -> Array:
     """P_m: lateral drift, height error beyond a band that widens with speed, rotation and acceleration.
 
@@ -94,21 +93,28 @@ def pelvis_motion(
       angular_velocity: of the pelvis, rad/s, [..., 3].
       acceleration: of the pelvis, gravity removed, m/s^2, [..., 3].
     """
-    drift = xp.abs(lateral_m)
-    drift = xp.where(drift < 0.05, 0.0, drift)
-    height_error = xp.abs(height_error_m)
-    band = config.height_band_m + config.height_band_per_speed * xp.abs(speed)
-    height_error = config.height_sharpness * xp.where(height_error < band, 0.0, height_error)
-    shaking = xp.abs(angular_velocity).sum(axis=-1) + xp.abs(acceleration).sum(axis=-1)
+    drift = abs(lateral_m)
+    drift = drift * (drift >= 0.05)
+    height_error = abs(height_error_m)
+    band = config.height_band_m + config.height_band_per_speed * abs(speed)
+    height_error = config.height_sharpness * (height_error * (height_error >= band))
+    shaking = total(abs(angular_velocity)) + total(abs(acceleration))
     return drift + height_error + config.shaking * shaking
 
 
-def weighted_terms(errors: dict[str, Array], config: RewardConfig, xp: Any) -> Array:
+def weights(config: RewardConfig) -> np.ndarray:
+    """What every term counts, in the order of `TERMS`, [9]."""
+    return np.array([config.scale * getattr(config, name) for name in TERMS])
+
+
+def weighted_terms(errors: dict[str, Array], weight: np.ndarray, xp: Any) -> Array:
     """The weighted, scaled terms in the order of `TERMS`, [..., 9]; their sum is the reward.
 
-    `errors` holds the two scores S_F and S_V under `SCORES`, and for every other term the
-    non-negative error E whose exp(-E) is rewarded.
+    Args:
+      errors: the two scores S_F and S_V under `SCORES`, and for every other term the non-negative error E whose
+        exp(-E) is rewarded, each [...].
+      weight: as `weights` returns it.
     """
     values = columns([errors[name] for name in TERMS], xp)
     values = xp.concatenate([values[..., : len(SCORES)], xp.exp(-values[..., len(SCORES) :])], axis=-1)
-    return values * np.array([config.scale * getattr(config, name) for name in TERMS])
+    return values * weight

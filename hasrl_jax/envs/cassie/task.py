@@ -126,6 +126,18 @@ class CassieState(NamedTuple):
     noise: Array  # [...] factor on the noise of the observations
 
 
+class Motion(NamedTuple):
+    """What an environment step ended with, as the reward, the termination and the measures look at it."""
+
+    up: Array  # [..., 3] the vertical in the frame of the pelvis
+    acceleration: Array  # [..., 3] of the pelvis in its frame, gravity removed, m/s^2
+    orientation: Array  # [..., 4] of the pelvis in the command's frame
+    velocity: Array  # [..., 3] of the pelvis in the command's frame, m/s
+    forward: Array  # [...] the first two of these
+    lateral: Array  # [...]
+    height: Array  # [...] of the pelvis above the ground, m
+
+
 class Constants(NamedTuple):
     """What the functions below share; none of it changes after `make`."""
 
@@ -139,6 +151,9 @@ class Constants(NamedTuple):
     env_step_s: float  # nominal
     library: gaits.Library | None  # of gaits, where there is a reference
     torque_limit: np.ndarray  # [10] of the nominal motors, N m
+    reward_weights: np.ndarray  # of `rewards.TERMS`
+    compares: bool  # whether any term that compares with a reference counts
+    least_upright: float  # cosine of the furthest tilt
 
 
 def make(config: Config) -> Task:
@@ -203,6 +218,9 @@ def _make(config: Config, asset: Path, ground: Callable[[mujoco.MjSpec], None] |
         env_step_s=config.physics.env_step_s,
         library=library,
         torque_limit=model.actuator_forcerange[:, 1].copy(),
+        reward_weights=rewards.weights(config.settings.reward),
+        compares=tracking.wanted(config.settings.reference.reward),
+        least_upright=float(np.cos(np.deg2rad(config.settings.termination.max_tilt_deg))),
     )
     drawn = commands.num_uniforms(config.settings.command) + commands.PUSH_UNIFORMS
     in_heading = config.settings.command.frame == "heading"
@@ -423,8 +441,11 @@ def following_phase(constants: Constants, state: CassieState, xp: Any) -> Array:
 
     The clock counts environment steps, as the published one does, not randomised seconds.
     """
-    cycle_s = clock.cycle_seconds(state.command[..., 0], constants.config.clock, xp)
-    return xp.where(state.standing, state.phase, xp.mod(state.phase + constants.env_step_s / cycle_s, 1.0))
+    cycle_s = clock.cycle_seconds(layout.numbers(state.command)[0], constants.config.clock, xp)
+    phase = (state.phase + constants.env_step_s / cycle_s) % 1.0
+    if constants.config.command.frame == "world":  # there the clock never rests
+        return phase
+    return xp.where(state.standing, state.phase, phase)
 
 
 def hidden_draws(uniforms: Array, is_drawn: Array, config: RandomizeConfig, xp: Any) -> dict[str, Array]:
@@ -491,11 +512,11 @@ def physics_features(constants: Constants, sensordata: Array, xp: Any) -> Array:
     ids = constants.ids
     quat = sensordata[..., ids.foot_orientation]
     if constants.config.command.frame == "world":
-        error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT)
+        error = rewards.quaternion_error(quat, rewards.NEUTRAL_FOOT_QUAT, xp)
     else:
         error = rewards.turn_products(quat, rewards.NEUTRAL_FOOT_QUAT, xp).reshape((*quat.shape[:-2], 6))
-    power = xp.abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]).sum(axis=-1, keepdims=True)
-    return xp.concatenate([sensordata[..., ids.foot_force], error, power], axis=-1)
+    power = layout.summed(abs(sensordata[..., ids.torque] * sensordata[..., ids.motor_speed]), xp)
+    return xp.concatenate([sensordata[..., ids.foot_force], error, power[..., None]], axis=-1)
 
 
 def step(
@@ -503,39 +524,35 @@ def step(
 ) -> Transition:
     """Reward, termination and next observation of the environment step that `reading` ends."""
     config, ids = constants.config, constants.ids
-    quat = reading.qpos[..., 3:7]
-    up = frames.up_in_body_frame(quat, xp)
-    acceleration = reading.sensordata[..., ids.acceleration] - GRAVITY_M_S2 * up
-    torque = reading.sensordata[..., ids.torque]
     told = commands.named(state.command, config.command)
     state = follow(constants, state, reading.qpos, xp)
-    errors = reward_errors(constants, state, action, reading, acceleration, xp)
-    terms = rewards.weighted_terms(errors, config.reward, xp)
+    motion = motion_of(constants, state, reading, xp)
+    errors = reward_errors(constants, state, told, action, reading, motion, xp)
+    terms = rewards.weighted_terms(errors, constants.reward_weights, xp)
     compared = None
-    if tracking.wanted(config.reference.reward):
-        seen = seen_by_tracking(constants, state, action, reading, acceleration, xp)
+    if constants.compares:
+        seen = seen_by_tracking(constants, state, action, reading, motion, xp)
         compared = tracking.weighted_terms(tracking.errors(seen, xp), config.reference.reward, xp)
         terms = xp.concatenate([terms, compared], axis=-1)
 
-    height = height_above_ground(constants, state, reading.qpos, xp)
     limits = config.termination
-    state = sense(constants, state, reading, acceleration, xp)
-    terminated = (height < limits.min_height_m) | (height > limits.max_height_m)
-    terminated = terminated | (up[..., 2] < np.cos(np.deg2rad(limits.max_tilt_deg)))
+    state = sense(constants, state, reading, motion.acceleration, xp)
+    terminated = (motion.height < limits.min_height_m) | (motion.height > limits.max_height_m)
+    terminated = terminated | (layout.numbers(motion.up)[2] < constants.least_upright)
     if compared is not None and config.reference.min_reward > 0:
         terminated = terminated | (compared.sum(axis=-1) < config.reference.min_reward)
-    velocity = pelvis_velocity(constants, state, reading.qvel, xp)
-    lag = next_lag(state, velocity[..., :2], limits.lag_memory_s, xp)
-    terminated = terminated | ((lag**2).sum(axis=-1) > limits.max_lag_m**2)
-    yaw = frames.heading(quat, xp)
-    measured = [velocity[..., :2], layout.columns([told["forward"], told["lateral"], height, yaw], xp)]
-    measured += [reading.averages[..., :2], reading.averages[..., -1:], state.phase[..., None]]
-    measured.append(toe_force(constants, reading.sensordata, xp))
+    along, across = next_lag(state, told, motion, limits.lag_memory_s, xp)
+    terminated = terminated | (along * along + across * across > limits.max_lag_m**2)
+    yaw = frames.heading(reading.qpos[..., 3:7], xp)
+    measured = [motion.forward, motion.lateral, told["forward"], told["lateral"], motion.height, yaw]
+    left_force, right_force, *_, power = layout.numbers(reading.averages)
+    measured += [left_force, right_force, power, state.phase]
+    measured += layout.numbers(toe_force(constants, reading.sensordata, xp))
     if config.command.frame == "heading":
-        yaw_rate = (up * reading.qvel[..., 3:6]).sum(axis=-1)
+        yaw_rate = layout.total(motion.up * reading.qvel[..., 3:6])
         error = frames.wrapped(yaw - state.target_heading, xp)
-        measured.append(layout.columns([yaw_rate, told["yaw_rate"], told["height"], error], xp))
-    measures = xp.concatenate(measured, axis=-1)
+        measured += [yaw_rate, told["yaw_rate"], told["height"], error]
+    measures = layout.columns(measured, xp)
 
     drawn, elapsed_s = commands.num_uniforms(config.command), duration_s(state)
     command_u, push_u = uniforms[..., :drawn], uniforms[..., drawn : drawn + commands.PUSH_UNIFORMS]
@@ -544,30 +561,32 @@ def step(
     command, command_s = commands.next_command(
         state.command, state.command_s, elapsed_s, command_u, config.command, config.reward.height_m, xp
     )
-    state = estimate(constants, state, reading.qvel, xp)
+    late_velocity, yaw_error = estimate(constants, state, reading.qvel, xp)
     if has_uneven_periods(config.randomize):
         scale = between(uniforms[..., -1], config.randomize.policy_period_scale)
         state = state._replace(period_scale=xp.where(state.is_drawn, scale, 1.0))
     state = state._replace(
         phase=following_phase(constants, state, xp),
         standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
-        lag=lag,
+        lag=layout.columns([along, across], xp),
         command=command,
         command_s=command_s,
         push=push,
         push_s=push_s,
+        late_velocity=late_velocity,
+        yaw_error=yaw_error,
         action=action,
-        torque=torque,
+        torque=reading.sensordata[..., ids.torque],
     )
-    observation = observe(constants, state, reading.qpos, reading.qvel, acceleration, noise_u, xp)
-    return Transition(state, observation, terms.sum(axis=-1), terminated, terms, measures)
+    observation = observe(constants, state, reading.qpos, reading.qvel, motion.acceleration, noise_u, xp)
+    return Transition(state, observation, layout.summed(terms, xp), terminated, terms, measures)
 
 
 def observe(
     constants: Constants, state: CassieState, qpos: Array, qvel: Array, acceleration: Array, noise_u: Array, xp: Any
 ) -> Array:
     """The inputs of the policy, [..., O], as `observation_entries` lists them; `noise_u`: [..., noise_size]."""
-    config, ids, offset = constants.config, constants.ids, state.encoder_offset
+    config = constants.config
     seen, orientation = state.late_velocity, qpos[..., 3:7]
     if config.randomize.enabled and config.randomize.yaw_drift_rad_s > 0:
         seen = frames.turned(seen, state.yaw_error, xp)
@@ -575,21 +594,23 @@ def observe(
     velocity = seen_velocity(constants, state, seen, xp)
     biased = velocity[..., :2] + state.velocity_bias
     if constants.legs is None:
-        height = qpos[..., 2] - terrain.height_at(qpos[..., 0], state.terrain, xp)
+        x, _, height = layout.numbers(qpos[..., :3])
+        height = height - terrain.height_at(x, state.terrain, xp)
         height = (height - slope_height(config, state, qpos, xp))[..., None]
     else:
         height = state.estimate[..., :1]
+    angle, speed = encoders(constants, state, qpos, xp), encoder_speeds(constants, qvel)
     values = {
         "pelvis_height": height,
         "pelvis_orientation": pelvis_orientation(constants, state, orientation, xp),
-        "motor_positions": qpos[..., ids.motor_qpos] + offset[..., :ACTION_SIZE],
+        "motor_positions": angle[..., :ACTION_SIZE],
         "pelvis_velocity": xp.concatenate([biased, velocity[..., 2:]], axis=-1),
         "pelvis_angular_velocity": qvel[..., 3:6],
-        "motor_velocities": qvel[..., ids.motor_qvel],
+        "motor_velocities": speed[..., :ACTION_SIZE],
         "pelvis_acceleration": acceleration,
-        "passive_positions": qpos[..., ids.passive_qpos] + offset[..., ACTION_SIZE:],
-        "passive_velocities": qvel[..., ids.passive_qvel],
-        "clock": clock_signal(state, xp),
+        "passive_positions": angle[..., ACTION_SIZE:],
+        "passive_velocities": speed[..., ACTION_SIZE:],
+        "clock": clock_signal(config, state, xp),
     }
     observation = xp.concatenate([*(values[entry.name] for entry in OBSERVATION), state.command], axis=-1)
     if not noise_u.shape[-1]:
@@ -602,7 +623,7 @@ def toe_force(constants: Constants, sensordata: Array, xp: Any) -> Array:
     """Ground force on each foot while it points down and so stands on its toe, else 0, N, [..., 2]."""
     ids = constants.ids
     up = frames.up_in_body_frame(sensordata[..., ids.foot_orientation], xp)
-    return xp.where((up * rewards.TOE_AXIS).sum(axis=-1) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
+    return xp.where(layout.total(up * rewards.TOE_AXIS) < -HEEL_UP, sensordata[..., ids.foot_force], 0.0)
 
 
 def with_command(
@@ -613,7 +634,7 @@ def with_command(
     standing = is_standing(config, command, observation[..., places["pelvis_velocity"]], xp)
     state = state._replace(command=command, command_s=xp.full_like(state.command_s, xp.inf), standing=standing)
     unchanged = observation[..., : places["clock"].start]
-    return state, xp.concatenate([unchanged, clock_signal(state, xp), command], axis=-1)
+    return state, xp.concatenate([unchanged, clock_signal(config, state, xp), command], axis=-1)
 
 
 def with_push(state: CassieState, force: Array, xp: Any) -> CassieState:
@@ -621,9 +642,10 @@ def with_push(state: CassieState, force: Array, xp: Any) -> CassieState:
     return state._replace(push=force, push_s=xp.zeros_like(state.push_s))
 
 
-def clock_signal(state: CassieState, xp: Any) -> Array:
+def clock_signal(config: CassieConfig, state: CassieState, xp: Any) -> Array:
     """What the policy sees of the clock, [..., 2]: zeros while it rests."""
-    return xp.where(state.standing[..., None], 0.0, clock.phase_signal(state.phase, xp))
+    signal = clock.phase_signal(state.phase, xp)
+    return signal if config.command.frame == "world" else xp.where(state.standing[..., None], 0.0, signal)
 
 
 def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> CassieState:
@@ -644,15 +666,19 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     return state._replace(path=qpos[..., :2] + frames.turned(drift, target, xp), target_heading=target)
 
 
-def next_lag(state: CassieState, velocity: Array, memory_s: float, xp: Any) -> Array:
-    """The distance behind the commands [..., 2] in m after an environment step of dt that ended with `velocity` v.
+def next_lag(
+    state: CassieState, told: dict[str, Array], motion: Motion, memory_s: float, xp: Any
+) -> tuple[Array, Array]:
+    """The distance behind the commands in m, along and across, after an environment step of dt that ended with v.
 
         lag' = lag e^(-dt / memory) + (command - v) dt
 
     A steady error of the speed settles at about `memory` times itself, so a robot that sets off is given time.
     """
-    step_s = duration_s(state)[..., None]
-    return state.lag * xp.exp(-step_s / memory_s) + (state.command[..., :2] - velocity) * step_s
+    step_s = duration_s(state)
+    kept, (along, across) = xp.exp(-step_s / memory_s), layout.numbers(state.lag)
+    along = along * kept + (told["forward"] - motion.forward) * step_s
+    return along, across * kept + (told["lateral"] - motion.lateral) * step_s
 
 
 def is_standing(config: CassieConfig, command: Array, velocity: Array, xp: Any) -> Array:
@@ -675,8 +701,8 @@ def duration_s(state: CassieState) -> Array:
     return state.env_step_s * state.period_scale
 
 
-def estimate(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> CassieState:
-    """`state` with what a state estimator would say of velocity and heading after an environment step.
+def estimate(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> tuple[Array, Array]:
+    """What a state estimator would say after an environment step: velocity, [..., 3], and error of the heading, [...].
 
     The velocity v is followed with the time constant T, as a low-pass filter does: the estimate moves by the share
     1 - exp(-duration / T) of its distance from v.
@@ -685,7 +711,7 @@ def estimate(constants: Constants, state: CassieState, qvel: Array, xp: Any) -> 
     if settings.enabled and max(settings.velocity_lag_s) > 0:
         share = -xp.expm1(-elapsed / xp.maximum(state.velocity_lag_s, 1e-6))
         late = state.late_velocity + share[..., None] * (late - state.late_velocity)
-    return state._replace(late_velocity=late, yaw_error=state.yaw_error + state.yaw_drift * elapsed)
+    return late, state.yaw_error + state.yaw_drift * elapsed
 
 
 def pelvis_orientation(constants: Constants, state: CassieState, quat: Array, xp: Any) -> Array:
@@ -719,20 +745,23 @@ def seen_velocity(constants: Constants, state: CassieState, qvel: Array, xp: Any
 
 def encoders(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
     """The angles that the encoders read, rad, [..., 16]."""
-    ids = constants.ids
-    angles = xp.concatenate([qpos[..., ids.motor_qpos], qpos[..., ids.passive_qpos]], axis=-1)
-    return angles + state.encoder_offset
+    return qpos.take(constants.ids.encoder_qpos, axis=-1, mode="clip") + state.encoder_offset
+
+
+def encoder_speeds(constants: Constants, qvel: Array) -> Array:
+    """How fast they turn, rad/s, [..., 16]."""
+    return qvel.take(constants.ids.encoder_qvel, axis=-1, mode="clip")
 
 
 def sense(constants: Constants, state: CassieState, reading: Reading, acceleration: Array, xp: Any) -> CassieState:
     """`state` with what a blind robot makes of its sensors after an environment step; that of others as it is."""
     if constants.legs is None:
         return state
-    ids, qvel = constants.ids, reading.qvel
+    qvel = reading.qvel
     above, velocity = kinematics.estimate(
         constants.legs,
         encoders(constants, state, reading.qpos, xp),
-        xp.concatenate([qvel[..., ids.motor_qvel], qvel[..., ids.passive_qvel]], axis=-1),
+        encoder_speeds(constants, qvel),
         qvel[..., 3:6],
         reading.qpos[..., 3:7],
         acceleration,
@@ -743,18 +772,35 @@ def sense(constants: Constants, state: CassieState, reading: Reading, accelerati
     return state._replace(estimate=xp.concatenate([above[..., None], velocity], axis=-1))
 
 
+def motion_of(constants: Constants, state: CassieState, reading: Reading, xp: Any) -> Motion:
+    """What an environment step ended with; `state` as `follow` returns it."""
+    quat = reading.qpos[..., 3:7]
+    up = frames.up_in_body_frame(quat, xp)
+    velocity = pelvis_velocity(constants, state, reading.qvel, xp)
+    forward, lateral = layout.numbers(velocity[..., :2])
+    return Motion(
+        up=up,
+        acceleration=reading.sensordata[..., constants.ids.acceleration] - GRAVITY_M_S2 * up,
+        orientation=pelvis_orientation(constants, state, quat, xp),
+        velocity=velocity,
+        forward=forward,
+        lateral=lateral,
+        height=height_above_ground(constants, state, reading.qpos, xp),
+    )
+
+
 def reward_errors(
     constants: Constants,
     state: CassieState,
+    told: dict[str, Array],
     action: Array,
     reading: Reading,
-    acceleration: Array,
+    motion: Motion,
     xp: Any,
 ) -> dict[str, Array]:
     """The scores and errors of paper Table I by term name, each [...]."""
     config, ids = constants.config, constants.ids
     settings = config.reward
-    told = commands.named(state.command, config.command)
     speed = told["forward"]
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(speed, config.clock, xp), xp)
     most_force: Array | float = rewards.MAX_FOOT_FORCE_N
@@ -762,15 +808,15 @@ def reward_errors(
         standing = state.standing[..., None]
         force_clock = xp.where(standing, clock.STAND_FORCE_CLOCK, force_clock)
         most_force = xp.where(standing, rewards.STAND_FOOT_FORCE_N, most_force)
-    foot_speed = xp.sqrt((reading.sensordata[..., ids.foot_velocity] ** 2).sum(axis=-1))
-    height = height_above_ground(constants, state, reading.qpos, xp)
-    orientation = pelvis_orientation(constants, state, reading.qpos[..., 3:7], xp)
-    pelvis_error = 1.0 - orientation[..., 0] ** 2  # `quaternion_error` from the upright pose (1, 0, 0, 0)
-    velocity = pelvis_velocity(constants, state, reading.qvel, xp)
-    velocity_error = xp.abs(velocity[..., :2] - state.command[..., commands.PLANAR])
-    speed_error = velocity_error[..., 0] + settings.lateral_velocity_share * velocity_error[..., 1]
+    foot_speed = xp.sqrt(layout.total(reading.sensordata[..., ids.foot_velocity] ** 2))
+    w = layout.numbers(motion.orientation)[0]
+    pelvis_error = 1.0 - w * w  # `quaternion_error` from the upright pose (1, 0, 0, 0)
+    forward_error, lateral_error = abs(motion.forward - speed), abs(motion.lateral - told["lateral"])
+    speed_error = forward_error + settings.lateral_velocity_share * lateral_error
     if config.command.frame == "world":
-        drift = reading.qpos[..., 1] - (state.path[..., 1] if settings.follow_lateral_command else 0.0)
+        drift = layout.numbers(reading.qpos[..., :2])[1]
+        if settings.follow_lateral_command:
+            drift = drift - layout.numbers(state.path)[1]
         foot_error, usual_height = reading.averages[..., 2:4], settings.height_m
     else:
         target = state.target_heading
@@ -779,24 +825,24 @@ def reward_errors(
         foot_error, usual_height = rewards.turned_quaternion_error(products, target, xp), told["height"]
         off = frames.wrapped(frames.heading(reading.qpos[..., 3:7], xp) - target, xp)
         speed_error = speed_error + settings.heading_share * xp.abs(off)
-    torque_change = xp.abs(reading.sensordata[..., ids.torque] - state.torque)
+    torque_change = abs(reading.sensordata[..., ids.torque] - state.torque)
     return {
         "foot_force": rewards.clock_score(force_clock, reading.averages[..., :2], most_force, xp),
         "foot_velocity": rewards.clock_score(-force_clock, foot_speed, rewards.MAX_FOOT_SPEED_M_S, xp),
-        "orientation": 10 * pelvis_error + 10 * foot_error.sum(axis=-1),
+        "orientation": 10 * pelvis_error + 10 * layout.total(foot_error),
         "pelvis_motion": rewards.pelvis_motion(
-            drift, height - usual_height, speed, reading.qvel[..., 3:6], acceleration, settings, xp
+            drift, motion.height - usual_height, speed, reading.qvel[..., 3:6], motion.acceleration, settings
         ),
         "velocity": settings.velocity_sharpness * speed_error,
-        "hip_roll": xp.abs(reading.qvel[..., ids.hip_roll_qvel]).sum(axis=-1),
-        "torque_change": 0.25 * (torque_change.sum(axis=-1) / ACTION_SIZE),
-        "action_change": 5 * (xp.abs(action - state.action).sum(axis=-1) / ACTION_SIZE),
-        "motor_power": reading.averages[..., -1] / settings.motor_power_w,
+        "hip_roll": layout.total(abs(reading.qvel[..., ids.hip_roll_qvel])),
+        "torque_change": 0.25 * (layout.summed(torque_change, xp) / ACTION_SIZE),
+        "action_change": 5 * (layout.summed(abs(action - state.action), xp) / ACTION_SIZE),
+        "motor_power": layout.numbers(reading.averages)[-1] / settings.motor_power_w,
     }
 
 
 def seen_by_tracking(
-    constants: Constants, state: CassieState, action: Array, reading: Reading, acceleration: Array, xp: Any
+    constants: Constants, state: CassieState, action: Array, reading: Reading, ended: Motion, xp: Any
 ) -> tracking.Seen:
     """What the terms that compare with a reference look at; `state` as `follow` returns it."""
     config, ids = constants.config, constants.ids
@@ -809,19 +855,18 @@ def seen_by_tracking(
         across = frames.turned(from_path, -state.target_heading, xp)[..., 1]
         from_path = layout.columns([motion["pelvis_position"][..., 0], across], xp)
         yaw_rate = told["yaw_rate"]
-    height = height_above_ground(constants, state, reading.qpos, xp)
     force_clock = clock.force_clocks(state.phase, clock.swing_fraction(told["forward"], config.clock, xp), xp)
     return tracking.Seen(
         reference=motion,
         motors=reading.qpos[..., ids.motor_qpos],
         motor_speeds=reading.qvel[..., ids.motor_qvel],
         springs=reading.qpos[..., ids.passive_qpos[[0, 3]]],
-        position=xp.concatenate([from_path, height[..., None]], axis=-1),
-        orientation=pelvis_orientation(constants, state, reading.qpos[..., 3:7], xp),
-        velocity=pelvis_velocity(constants, state, reading.qvel, xp),
+        position=xp.concatenate([from_path, ended.height[..., None]], axis=-1),
+        orientation=ended.orientation,
+        velocity=ended.velocity,
         command=layout.columns([told["forward"], told["lateral"], yaw_rate], xp),
         angular_velocity=reading.qvel[..., 3:6],
-        acceleration=acceleration,
+        acceleration=ended.acceleration,
         torque_share=reading.sensordata[..., ids.torque] / constants.torque_limit,
         foot_force=reading.averages[..., :2],
         force_clock=xp.where(state.standing[..., None], 0.0, force_clock),  # no foot swings in a stand
@@ -833,10 +878,11 @@ def seen_by_tracking(
 def height_above_ground(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Array:
     """Height of the pelvis above the ground, m, [...], as the reward and the termination count it."""
     half_length_m = constants.config.terrain.average_m
-    height = qpos[..., 2] - terrain.mean_height(qpos[..., 0], half_length_m, state.terrain, xp)
+    x, _, height = layout.numbers(qpos[..., :3])
+    height = height - terrain.mean_height(x, half_length_m, state.terrain, xp)
     return height - slope_height(constants.config, state, qpos, xp)
 
 
 def slope_height(config: CassieConfig, state: CassieState, qpos: Array, xp: Any) -> Array | float:
     """Height of a sloping floor under the pelvis, m, [...]."""
-    return (state.slope * qpos[..., :2]).sum(axis=-1) if max(config.randomize.floor_slope_deg) > 0 else 0.0
+    return layout.total(state.slope * qpos[..., :2]) if max(config.randomize.floor_slope_deg) > 0 else 0.0

@@ -78,7 +78,7 @@ def errors(seen: Seen, xp: Any) -> dict[str, Array]:
         "joints": ((seen.motors - seen.reference["motor_positions"]) ** 2 * JOINT_WEIGHTS).sum(axis=-1),
         "springs": ((seen.springs - seen.reference["springs"]) ** 2).sum(axis=-1),
         "center_of_mass": (off**2).sum(axis=-1),
-        "attitude": rewards.quaternion_error(seen.orientation, orientation),
+        "attitude": rewards.quaternion_error(seen.orientation, orientation, xp),
         "path": (off[..., :2] ** 2).sum(axis=-1),
         "height": xp.abs(off[..., 2]),
         "forward_speed": speed_error[..., 0],
