@@ -105,16 +105,26 @@ def play(policy, model_file, seconds, command):
             return
 
 
+def setting(text):
+    """NAME=VALUE of the command line."""
+    name, _, value = text.partition("=")
+    return name, float(value)
+
+
 def main():
     """The command line; returns 0 where the robot stayed up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policy", help="an .onnx file of `hasrl export`")
     parser.add_argument("model", type=Path, help="the .xml file of `hasrl export --model`")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--command", nargs="*", default=["forward=1.0"], metavar="NAME=VALUE")
+    parser.add_argument("--command", nargs="*", type=setting, default=[("forward", 1.0)], metavar="NAME=VALUE")
     given = parser.parse_args()
-    told = {name: float(value) for name, value in (item.split("=") for item in given.command)}
-    played = list(play(given.policy, given.model, given.seconds, told))
+    for file in (given.policy, given.model):
+        if not Path(file).is_file():
+            sys.exit(f"error: got {file}; there is no such file")
+    played = list(play(given.policy, given.model, given.seconds, dict(given.command)))
+    if not played:
+        sys.exit(f"error: --seconds: got {given.seconds:g}; expected one step of the policy or more")
     data, inferences_s = played[-1][0], [inference_s for _, _, _, inference_s in played]
     x, y, height = data.qpos[0:3]
     print(f"{data.time:.2f} s: x {x:.2f} m, y {y:.2f} m, pelvis at {height:.2f} m")

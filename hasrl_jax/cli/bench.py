@@ -11,6 +11,7 @@ from typing import Protocol
 
 from hasrl_jax.bench.documents import refresh
 from hasrl_jax.bench.report import claim_file, describe_machine
+from hasrl_jax.cli.options import OneLineParser
 from hasrl_jax.cli.parsing import run as run_command
 
 # name -> (module with the functions of `Bench`, one line for --help); modules load only when they are run
@@ -50,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the benchmark that the arguments name; returns the exit status."""
     argv = sys.argv[1:] if argv is None else argv
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    parser = argparse.ArgumentParser(prog="python -m hasrl_jax.bench", description=__doc__)
+    parser = OneLineParser(prog="python -m hasrl_jax.bench", description=__doc__)
     subparsers = parser.add_subparsers(dest="name", required=True, metavar="NAME")
     for name, (module, summary) in BENCHES.items():
         subparser = subparsers.add_parser(name, help=summary, description=summary)

@@ -1,18 +1,37 @@
 """Command-line arguments of the programs: complaints on one line, and outputs checked before the work."""
 
 import argparse
+import re
 import tempfile
 from pathlib import Path
 from typing import NoReturn
 
 from hasrl_jax.errors import ConfigError
 
+KINDS = {"int": "a whole number", "float": "a number"}
+
 
 class OneLineParser(argparse.ArgumentParser):
-    """An argument parser whose complaint is one line on stderr, without the usage; exit status 2."""
+    """An argument parser whose complaint is one line on stderr, in our words and without the usage; exit status 2."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"error: {message.removeprefix('argument ')}\n")
+        self.exit(2, f"error: {_in_our_words(message.removeprefix('argument '))}\n")
+
+
+def _in_our_words(message: str) -> str:
+    """A complaint of argparse as ours are: what was given, and what is expected instead."""
+    number = re.fullmatch(r"(.*): invalid (int|float) value: (.*)", message, re.DOTALL)
+    if number:
+        return f"{number[1]}: got {number[3]}; expected {KINDS[number[2]]}"
+    choice = re.fullmatch(r"(.*): invalid choice: (.*) \(choose from (.*)\)", message, re.DOTALL)
+    if choice:
+        return one_of(choice[1], choice[2], choice[3])
+    return re.sub(r": expected (one|at least one) argument$", ": missing; expected a value", message)
+
+
+def one_of(option: str, value: str, choices: str) -> str:
+    """A complaint about a value that is none of the choices, which argparse and tyro may have quoted."""
+    return f"{option}: got {value}; expected one of " + choices.replace("'", "")
 
 
 def add_policy_options(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from hasrl_jax.cli.options import OneLineParser
+from hasrl_jax.cli.options import OneLineParser, one_of
 from hasrl_jax.config import curriculum, strict_yaml, tasks
 from hasrl_jax.config.checks import check
 from hasrl_jax.config.convert import from_dict, to_dict
@@ -29,6 +29,13 @@ from hasrl_jax.policy.loading import load_policy_parameters, under_reference_phy
 from hasrl_jax.policy.numpy_networks import Parameters
 
 PYTHONS_WORDS = re.compile(r"(?P<kind>could not convert|invalid literal)[^:]*: (?P<value>'.*')")
+TYROS_WORDS = {  # and ours
+    r"Missing value for argument '(.*)'\. Expected 1 values?\.": r"\1: missing; expected a value",
+    r"Missing value for argument '(.*)'\. Expected (.* values)\.": r"\1: missing; expected \2",
+    r"Unrecognized options: (.*)": r"got \1, which no option takes",
+    r"Error parsing (.*)": r"\1",
+}
+TYROS_CHOICE = re.compile(r"invalid choice ('.*') for argument '(.*)'\. Expected one of \((.*)\)\.")
 NUMBERS = {"could not convert": "a number", "invalid literal": "a whole number"}
 SHORTHAND = {"--num-workers": "--collect.num-workers", "--ray-address": "--ray.address"}
 
@@ -250,4 +257,7 @@ def _one_line(complaint: str) -> str:
     lines = [line.strip(" │╭╮╰╯─") for line in plain.splitlines()][1:]
     blocks = itertools.groupby(lines, lambda line: bool(line.strip("-")))  # rules separate them
     first = next((" ".join(block) for has_text, block in blocks if has_text), "") or " ".join(plain.split())
+    for theirs, ours in TYROS_WORDS.items():
+        first = re.sub(f"^{theirs}$", ours, first)
+    first = TYROS_CHOICE.sub(lambda found: one_of(found[2], found[1], found[3]), first)
     return PYTHONS_WORDS.sub(lambda found: f"got {found['value']}; expected {NUMBERS[found['kind']]}", first)

@@ -27,6 +27,7 @@ METRICS_FILE = "metrics.jsonl"
 TENSORBOARD_DIRECTORY = "tensorboard"
 CHECKPOINTS_DIRECTORY = "checkpoints"
 LOCK_FILE = "run.lock"
+OF_A_RUN = (CONFIG_FILE, METRICS_FILE, TENSORBOARD_DIRECTORY, CHECKPOINTS_DIRECTORY, LOCK_FILE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +51,8 @@ def open_run(config: Config, resume: bool) -> Iterator[RunDirectory]:
       resume: continue the run that is there.
 
     Raises:
-      RunError: in use by another process, holds a run already, holds none to resume, leads elsewhere by links, cannot
-        be written, or has a name that is not UTF-8.
+      RunError: in use by another process, holds a run already, or something else, holds none to resume, leads elsewhere
+        by links, cannot be written, or has a name that is not UTF-8.
     """
     _require_utf8(Path(config.run_dir))
     if resume:
@@ -107,6 +108,7 @@ def _create(config: Config) -> Path:
     path = Path(config.run_dir)
     try:
         if config.run_dir:
+            _require_nothing_else(path)
             path.mkdir(parents=True, exist_ok=True)
             return _protected(path, config)
         name = f"{config.task}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -138,7 +140,7 @@ def _require_inside(path: Path) -> None:
       RunError: names the link.
     """
     inside = path.resolve()
-    for name in (CONFIG_FILE, METRICS_FILE, TENSORBOARD_DIRECTORY, CHECKPOINTS_DIRECTORY, LOCK_FILE):
+    for name in OF_A_RUN:
         place = path / name
         if not place.resolve().is_relative_to(inside):
             raise RunError(f"{place}: a link that leads out of the run, to {place.resolve()}; put what it names here")
@@ -161,6 +163,16 @@ def _require_run(path: Path) -> None:
         hint = f"; did you mean {runs[0]}?" if runs else ""
         raise RunError(f"{path}: not a run directory, it has no {CONFIG_FILE}{hint}")
     _require_inside(path)
+
+
+def _require_nothing_else(path: Path) -> None:
+    """Refuses a folder of somebody's other files; hidden ones, and those without content, do not count."""
+    if not path.is_dir() or (path / CONFIG_FILE).exists():
+        return
+    for other in sorted(path.iterdir()):
+        has_content = any(other.iterdir()) if other.is_dir() else other.exists() and other.stat().st_size
+        if has_content and not other.name.startswith((".", *OF_A_RUN)):
+            raise RunError(f"{path}: holds {other.name} and no run; choose a new folder, {path / 'NAME'}")
 
 
 def _require_no_run(path: Path) -> None:

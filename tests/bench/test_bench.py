@@ -38,6 +38,15 @@ def tiny(tmp_path: Path) -> str:
     return str(path)
 
 
+def test_a_name_that_is_none_is_refused_on_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["colector"])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: NAME: got 'colector'; expected one of collector, scaling")
+    assert error.count("\n") == 1
+
+
 def test_parity_measures_and_writes(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     figures, table = tmp_path / "new" / "parity.json", tmp_path / "new" / "parity.md"
     arguments = ["--config", tiny, "--states", "4", "--horizons", "3", "1", "--double"]

@@ -113,10 +113,18 @@ def test_a_refusal_says_what_would_work():
         cli.override(base, ["--ppo.clop=1"], "train")
     with pytest.raises(ConfigError, match=r"^--forward: unknown option; did you mean --cassie.command.forward-m-s\?$"):
         cli.override(base, ["--forward", "1"], "train")
-    with pytest.raises(ConfigError, match=r"--ppo.clip: got 'abc'; expected a number$"):
+    with pytest.raises(ConfigError, match=r"^--ppo.clip: got 'abc'; expected a number$"):
         cli.override(base, ["--ppo.clip", "abc"], "train")
-    with pytest.raises(ConfigError, match=r"--seed: got '1.5'; expected a whole number$"):
+    with pytest.raises(ConfigError, match=r"^--seed: got '1.5'; expected a whole number$"):
         cli.override(base, ["--seed", "1.5"], "train")
+    with pytest.raises(ConfigError, match=r"^--ppo.clip: missing; expected a value$"):
+        cli.override(base, ["--ppo.clip"], "train")
+    with pytest.raises(ConfigError, match=r"^--cassie.push.force-n: missing; expected 2 values$"):
+        cli.override(base, ["--cassie.push.force-n", "1"], "train")
+    with pytest.raises(ConfigError, match=r"^got stray, which no option takes$"):
+        cli.override(base, ["stray"], "train")
+    with pytest.raises(ConfigError, match=r"^--backend: got 'gpu'; expected one of cpu_pool, ray, mjx$"):
+        cli.override(base, ["--backend=gpu"], "train")
     with pytest.raises(ConfigError, match=r"^task: got 'hopper'; expected cassie, cartpole.*, or MODULE:NAME"):
         cli.override(base, ["--task", "hopper"], "train")
     with pytest.raises(ConfigError, match=r"^ppo\.clip: got 2\.0; expected 0\.001 to 0\.999$"):

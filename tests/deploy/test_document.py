@@ -62,8 +62,9 @@ def test_its_reference_is_what_residual_actions_are_added_to(frame):
         np.testing.assert_allclose(targets[robot], np.clip(action[robot], -1, 1) + motors, atol=2e-5)
 
 
-def test_its_numpy_walks(tmp_path):
-    config, parameters = loading.load_policy_parameters(None, "released")
+@pytest.mark.parametrize("policy", ["released", "released-fast"])
+def test_its_numpy_walks(tmp_path, policy):
+    config, parameters = loading.load_policy_parameters(None, policy)
     command = {"forward_m_s": [1.0, 1.0], "lateral_m_s": [0.0, 0.0], "stand_probability": 0.0}
     config = from_dict({"cassie": {"command": command, "randomize": {"enabled": False}}}, config)
     export.write(tmp_path / "policy.npz", "npz", config, parameters, "", steps=2)

@@ -207,7 +207,7 @@ def test_render_says_what_is_wrong_on_one_line():
     command = [sys.executable, "-m", "hasrl_jax.render", "--seconds", "soon"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: --seconds: invalid float value: 'soon'\n"
+    assert done.stderr == "error: --seconds: got 'soon'; expected a number\n"
 
 
 def test_a_policy_was_trained_for_the_widest_of_its_stages():

@@ -43,6 +43,7 @@ def example():
         ("released", {"forward": 1.0, "lateral": 0.05}),
         ("released-steer", {"forward": 0.6, "lateral": 0.1, "yaw_rate": 0.6, "height": 0.8}),
         ("released-steer", {}),
+        ("released-fast", {"forward": 2.5, "yaw_rate": 0.3}),
     ],
 )
 def test_it_sees_and_does_what_our_environment_does(tmp_path, example, policy, told):
@@ -93,6 +94,13 @@ def test_it_imports_neither_the_package_nor_jax_and_tells_its_inference_time(tmp
     done = subprocess.run([*run, "--command", "forward=1.0"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "2.00 s: x" in done.stdout and "inference: median" in done.stdout
-    refused = subprocess.run([*run, "--command", "sideways=1"], capture_output=True, text=True, timeout=120)
-    assert refused.returncode == 1
-    assert refused.stderr.strip() == "error: --command: got sideways; expected forward, lateral"
+    for wrong, line in (
+        (["--command", "sideways=1"], "error: --command: got sideways; expected forward, lateral"),
+        (["--command", "forward"], "play_onnx.py: error: argument --command: invalid setting value: 'forward'"),
+        (["--seconds", "0"], "error: --seconds: got 0; expected one step of the policy or more"),
+    ):
+        refused = subprocess.run([*run, *wrong], capture_output=True, text=True, timeout=120)
+        assert refused.returncode != 0 and refused.stderr.splitlines()[-1] == line
+    run[3] = "nowhere.onnx"
+    refused = subprocess.run(run, capture_output=True, text=True, timeout=120)
+    assert refused.stderr == "error: got nowhere.onnx; there is no such file\n"

@@ -37,6 +37,7 @@ def program(tmp_path_factory):
         ("released", ["forward=1.5", "lateral=0.05"]),
         ("released-steer", ["forward=0.6", "yaw_rate=0.6", "height=0.8"]),
         ("released-steer", []),
+        ("released-fast", ["forward=2.5", "yaw_rate=0.3"]),
     ],
 )
 def test_it_goes_where_the_python_loop_goes(tmp_path, program, policy, command):
@@ -49,6 +50,11 @@ def test_it_goes_where_the_python_loop_goes(tmp_path, program, policy, command):
     where, inference = in_cpp.stdout.splitlines()
     assert where.startswith("3.00 s: x ") and where == in_python.stdout.splitlines()[0]
     assert inference.startswith("inference: median ")
-    refused = subprocess.run([program, onnx, xml, "3", "sideways=1"], capture_output=True, text=True, timeout=120)
-    assert refused.returncode == 1
-    assert refused.stderr == "error: got sideways=1; it is no NAME=VALUE of a command\n"
+    for wrong, line in (
+        (["3", "sideways=1"], "got sideways=1; it is no NAME=VALUE of a command"),
+        (["3", "forward=fast"], "got forward=fast; expected a number"),
+        (["0"], "got SECONDS 0; expected one step of the policy or more"),
+        (["long"], "got SECONDS long; expected a number"),
+    ):
+        refused = subprocess.run([program, onnx, xml, *wrong], capture_output=True, text=True, timeout=120)
+        assert (refused.returncode, refused.stderr) == (1, f"error: {line}\n")

@@ -107,6 +107,28 @@ def test_refuses_a_second_run_in_the_same_directory(tmp_path: Path) -> None:
         open_run(config, resume=False).__enter__()
 
 
+@pytest.mark.parametrize("name", ["thesis.txt", "walk/config.yaml"])
+def test_a_folder_of_other_files_is_refused_and_left_as_it_is(tmp_path: Path, name: str) -> None:
+    theirs = tmp_path / "theirs"
+    (theirs / name).parent.mkdir(parents=True)
+    (theirs / name).write_text("mine")
+    theirs.chmod(0o755)
+    complaint = f"^{theirs}: holds {name.partition('/')[0]} and no run; choose a new folder, {theirs}/NAME$"
+    with pytest.raises(RunError, match=complaint), open_run(config_for(theirs, private=True), resume=False):
+        pass
+    assert [file for file in theirs.rglob("*") if file.is_file()] == [theirs / name]
+    assert theirs.stat().st_mode & 0o777 == 0o755
+
+
+def test_a_folder_that_is_as_good_as_empty_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "log.txt").touch()
+    (tmp_path / "films").mkdir()
+    (tmp_path / ".gitignore").write_text("*")
+    (tmp_path / "link").symlink_to("nowhere")
+    with open_run(config_for(tmp_path), resume=False) as run:
+        assert run.path == tmp_path
+
+
 def test_a_failed_start_does_not_block_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_for(tmp_path / "run")
     with monkeypatch.context() as patch:

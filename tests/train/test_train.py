@@ -268,7 +268,7 @@ def test_an_option_without_its_value_is_one_line(capsys):
     with pytest.raises(SystemExit) as stopped:
         train_main(["--config"])
     assert stopped.value.code == 2
-    assert capsys.readouterr().err == "error: --config: expected one argument\n"
+    assert capsys.readouterr().err == "error: --config: missing; expected a value\n"
 
 
 def test_resuming_the_checkpoints_of_a_run_names_the_run(tmp_path, capsys):

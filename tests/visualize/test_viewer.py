@@ -233,6 +233,16 @@ def test_the_page_is_open_to_this_machine_only(live: Live) -> None:
     assert browser.free_port(port) == port  # nothing listens any more
 
 
+def test_a_phone_shows_what_one_touches_before_what_one_reads(live: Live) -> None:
+    pytest.importorskip("viser")
+    page = browser.Browser(live, port=0)
+    try:
+        touched = [slider.order for slider in page._sliders] + [page._push_button.order, page._force.order]
+        assert touched == sorted(touched) and touched[-1] < page._readout.order < page._paused.order
+    finally:
+        page.close()
+
+
 def test_what_is_typed_beyond_the_ends_of_a_slider_counts_as_its_ends(live: Live) -> None:
     pytest.importorskip("viser")
     page = browser.Browser(live, port=0)
@@ -363,7 +373,9 @@ def test_without_viser_one_line_says_what_to_install(
     [
         (["--port", "70000"], "--port"),
         (["--seed", "-1"], "--seed"),
-        (["--port", "x"], "--port"),
+        (["--port", "x"], "--port: got 'x'; expected a whole number"),
+        (["--physics", "fast"], "--physics: got 'fast'; expected one of paper, training"),
+        (["--policy"], "--policy: missing; expected a value"),
         (["--prt", "1"], "--prt"),
         (["--host", "no.such.host.invalid"], "no.such.host.invalid"),
     ],

@@ -51,6 +51,14 @@ std::string after(const std::string& json, const std::string& key, size_t from =
   return found == std::string::npos ? "" : json.substr(found + quoted.size());
 }
 
+// A number of the command line.
+double given(const std::string& text, const std::string& where) {
+  char* end = nullptr;
+  const double value = std::strtod(text.c_str(), &end);
+  if (text.empty() || *end || !std::isfinite(value)) fail("got " + where + "; expected a number");
+  return value;
+}
+
 double number(const std::string& json, const std::string& key, double otherwise = 0) {
   const std::string text = after(json, key);
   return text.empty() ? otherwise : std::strtod(text.c_str(), nullptr);
@@ -203,7 +211,7 @@ int main(int argc, char** argv) {
   for (int i = 4; i < argc; ++i) {
     const std::string item = argv[i], name = item.substr(0, item.find('='));
     if (!memory.command.count(name) || name == item) fail("got " + item + "; it is no NAME=VALUE of a command");
-    memory.command[name] = std::strtod(item.c_str() + name.size() + 1, nullptr);
+    memory.command[name] = given(item.substr(name.size() + 1), item);
   }
 
   char message[1000] = "";
@@ -222,8 +230,9 @@ int main(int argc, char** argv) {
   }
   std::vector<float> carry(carry_size, 0.0f);
   std::vector<double> inference_ms;
-  const double seconds = std::strtod(argv[3], nullptr);
+  const double seconds = given(argv[3], std::string("SECONDS ") + argv[3]);
   const int steps = static_cast<int>(std::lround(seconds * rate_hz));
+  if (steps < 1) fail(std::string("got SECONDS ") + argv[3] + "; expected one step of the policy or more");
   const int physics_steps = static_cast<int>(std::lround(1 / rate_hz / model->opt.timestep));
   for (int step = 0; step < steps && data->qpos[2] > lowest; ++step) {
     std::vector<float> observation = observe(model, data, table, constants, memory, step > 0);

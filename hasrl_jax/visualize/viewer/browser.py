@@ -103,16 +103,17 @@ class Browser:
     def _build_panel(self, live: Live, randomized: bool) -> None:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
-        self._readout = gui.add_markdown("")
         self._sliders: list[viser.GuiSliderHandle[float]] = []
         if live.commands:
             with gui.add_folder("Command"):
                 self._sliders = [self._slider(command) for command in live.commands]
         if live.can_push:
             with gui.add_folder("Push"):
+                self._push_button = gui.add_button("push")
+                self._push_button.on_click(self._ask_for_push)
                 self._force = gui.add_slider("force N", *PUSH_N, step=10.0, initial_value=60.0)
                 self._direction = gui.add_dropdown("direction", tuple(DIRECTIONS_DEG))
-                gui.add_button("push").on_click(self._ask_for_push)
+        self._readout = gui.add_markdown("")  # what one touches comes first: a phone shows half of the panel
         with gui.add_folder("Episode"):
             self._robot = None
             if live.can_randomize:
