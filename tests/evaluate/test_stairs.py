@@ -29,8 +29,11 @@ def test_rows_cover_speeds_heights_and_other_ground() -> None:
 
 
 def test_a_row_sets_the_ground_and_leaves_what_the_policy_sees() -> None:
-    trained = shipped("cassie_stairs")
+    other = {"motor": {"torque_speed_curve": False}, "push": {"force_n": [50, 90]}, "terrain": {"level_share": 0.5}}
+    trained = from_dict({"cassie": other}, shipped("cassie_stairs"))
     config = stairs.row_config(trained, Row("down", 0.5, 0.2))
+    assert config.cassie.motor.torque_speed_curve
+    assert (config.cassie.push.force_n, config.cassie.terrain.level_share) == ((0.0, 0.0), 0.0)
     assert config.cassie.observe == "blind" and config.cassie.clock == trained.cassie.clock
     assert config.cassie.terrain.step_height_m == (-0.2, -0.2) and config.cassie.terrain.steps == (1, 8)
     assert config.cassie.command.forward_m_s == (0.5, 0.5)
