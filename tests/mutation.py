@@ -1,12 +1,14 @@
 """Changes lines of the mathematics one by one and runs the tests that are for them: `make mutation`.
 
-Every change that no test notices is printed; docs/mutation.md says why those that are left are left. Works on a copy,
-in a process of its own for each change. Arguments: names of modules as below; none stands for all of them.
+Every change is printed, with whether a test noticed it; docs/mutation.md says why those that are left are left. Works
+on a copy, in a process of its own for each change. Arguments: names of modules as below; none stands for all of them,
+and `learn/returns:24` leaves out the first 24 changes, for a run that goes on where another ended.
 """
 
 import compileall
 import difflib
 import importlib
+import itertools
 import os
 import re
 import shutil
@@ -49,7 +51,7 @@ OPERATORS = re.compile(
     r"|ReplaceComparisonOperator_(Gt_GtE|GtE_Gt|Lt_LtE|LtE_Lt|Eq_NotEq|NotEq_Eq|Is_IsNot|IsNot_Is|In_NotIn)"
     r"|ReplaceUnaryOperator_Delete_\w+|(?!Replace(Binary|Comparison|Unary)Operator)\w+)"
 )
-TIMEOUT_S = 600
+CPU_LIMIT_S = 600  # of CPU time: other work on the machine must not pass for a change that was noticed
 # Loaded once, for all processes; nothing of the package itself, of which each process loads its own version.
 LOADED = (
     "flax.linen",
@@ -86,7 +88,7 @@ def passes(copy: Path, tests: list[str], chosen: str, write: bool = False) -> bo
         try:
             os.chdir(copy)
             os.setpgid(0, 0)
-            signal.alarm(TIMEOUT_S)
+            signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT_S)
             sys.dont_write_bytecode = not write
             sys.path.insert(0, str(copy))
             null = os.open(os.devnull, os.O_RDWR)
@@ -103,8 +105,8 @@ def passes(copy: Path, tests: list[str], chosen: str, write: bool = False) -> bo
     return os.waitpid(process, 0)[1] == 0
 
 
-def run(module: str) -> None:
-    """Prints how many changes of a module were noticed, and those that were not."""
+def run(module: str, first: int) -> None:
+    """Prints how many changes of a module from number `first` on were noticed, and those that were not."""
     tracked = subprocess.run(("git", "ls-files"), cwd=ROOT, capture_output=True, text=True, check=True).stdout
     tests, chosen = MODULES[module]
     with tempfile.TemporaryDirectory() as directory:
@@ -118,22 +120,22 @@ def run(module: str) -> None:
             raise SystemExit(f"{module}: its tests fail before anything is changed")
         for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
             compiled.unlink()  # or it would take the place of a change made in the same second
-        source, tried, survivors = path.read_text(), 0, []
-        for what, changed in changes(source):
+        survivors, end = 0, first
+        for end, (what, changed) in enumerate(itertools.islice(changes(path.read_text()), first, None), first + 1):
             path.write_text(changed)
-            tried += 1
-            if passes(copy, tests, chosen):
-                survivors.append(what)
-                print(f"  {module}.py:{what}", flush=True)
-    print(f"{module}: {tried - len(survivors)} of {tried} noticed", flush=True)
+            survived = passes(copy, tests, chosen)
+            survivors += survived
+            print(f"  {end} {'UNNOTICED' if survived else 'noticed'} {module}.py:{what}", flush=True)
+    print(f"{module}: {end - first - survivors} of {end - first} noticed", flush=True)
 
 
 def main(modules: list[str]) -> None:
     os.environ |= {"JAX_PLATFORMS": "cpu", "NPROC": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     for name in LOADED:
         importlib.import_module(name)
-    for module in modules or MODULES:
-        run(module)
+    for argument in modules or MODULES:
+        module, _, first = argument.partition(":")
+        run(module, int(first or 0))
 
 
 if __name__ == "__main__":

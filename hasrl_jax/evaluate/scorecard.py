@@ -4,8 +4,6 @@ C MuJoCo at 2 kHz, mean action, seeds that no training uses. Every row is a numb
 pelvis below 0.6 m or a tilt above 45 degrees, whatever the policy was trained with. Rows are shared among processes.
 """
 
-import hashlib
-import json
 import logging
 import multiprocessing
 import os
@@ -19,10 +17,11 @@ import numpy as np
 
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config, available_cores
-from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
+from hasrl_jax.envs.cassie.settings import RandomizeConfig
 from hasrl_jax.envs.registry import Robot, make_task, make_task_on
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.evaluate import gait
+from hasrl_jax.evaluate import report as reports
 from hasrl_jax.evaluate.page import percent, write_page
 from hasrl_jax.evaluate.rollout import run_episodes
 from hasrl_jax.evaluate.statistics import columns, mean_interval, settled_errors, share_interval
@@ -251,15 +250,13 @@ def write(
     Raises:
       ConfigError: a policy of another task; OSError: the directory cannot be written.
     """
-    for name, (config, _) in policies.items():
-        if not isinstance(config.settings, CassieConfig):
-            raise ConfigError(f"--scorecard: {name} is of task {config.task}; only policies that walk have one")
+    reports.refuse_other_tasks(policies, "--scorecard", "policies that walk have one")
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scorecard.json"
     report: dict[str, Any] = {"episodes": episodes, "seconds": seconds, "seed": seed, "command": command}
     report |= {"date": time.strftime("%Y-%m-%d"), "digests": {}, "policies": {}}
     report["physics_hz"] = 1 / next(iter(policies.values()))[0].physics.timestep_s
-    earlier = _read(path)
+    earlier = reports.read(path)
     own_digest = _digest(*next(iter(policies.values())), seconds)
     report["models"] = {
         label: found for label, found in earlier.get("models", {}).items() if found["policy_digest"] == own_digest
@@ -274,13 +271,13 @@ def write(
         measured, started = report["policies"][name], time.monotonic()
         for row in measure(config, parameters, episodes, seconds, seed, len(measured)):
             measured.append(row)
-            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            reports.write(report, path)
             if name == own and len(measured) < len(rows(config)):  # the last one is written below
                 write_page(report, directory)
             robot = "randomised" if row["randomized"] else "nominal"
             share, spent = percent(row["share_up"]), time.monotonic() - started
             log.info("%s, %s, %s: %s up, %.0f s so far", name, row["title"], robot, share, spent)
-    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    reports.write(report, path)
     write_page(report, directory)
 
 
@@ -301,7 +298,7 @@ def write_on_model(
       ConfigError: there is no scorecard, or the model cannot be played on; OSError: it cannot be written.
     """
     path = directory / "scorecard.json"
-    report = _read(path)
+    report = reports.read(path)
     if not report.get("policies"):
         raise ConfigError(f"--scorecard: {path} holds no scorecard; expected one made without --model")
     make_task_on(row_config(config, model_rows()[0], SHORT_S), robot)  # complains before the work
@@ -314,17 +311,8 @@ def write_on_model(
         entry["rows"].append(row)
         log.info("%s, %s: %s up", robot.label, row["title"], percent(row["share_up"]))
     report.setdefault("models", {})[robot.label] = entry
-    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    reports.write(report, path)
     write_page(report, directory)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """An earlier report; empty when there is none that can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) and isinstance(found.get("policies"), dict) else {}
 
 
 def refuse_settings(arguments: list[str], what: str = "a scorecard") -> None:
@@ -342,10 +330,7 @@ def refuse_settings(arguments: list[str], what: str = "a scorecard") -> None:
 def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
     """Tells policies apart, and what they are played under."""
     played = [to_dict(row_config(config, row, seconds)) for row in rows(config)]
-    digest = hashlib.sha256(json.dumps([REVISION, played], sort_keys=True).encode())
-    for name in sorted(parameters):
-        digest.update(name.encode() + parameters[name].tobytes())
-    return digest.hexdigest()
+    return reports.digest([REVISION, played], parameters)
 
 
 def measure(

@@ -5,8 +5,6 @@ far landing, or a few meters on, before the time is over and without a fall. C M
 Source: Siekmann et al. 2021, success against approach speed, 150 trials a point; the ranges of the ground are ours.
 """
 
-import hashlib
-import json
 import logging
 import time
 from functools import partial
@@ -18,10 +16,10 @@ import numpy as np
 from hasrl_jax.config.convert import from_dict, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import terrain
-from hasrl_jax.envs.cassie.settings import CassieConfig, RandomizeConfig
+from hasrl_jax.envs.cassie.settings import RandomizeConfig
 from hasrl_jax.envs.cpu_engine import EnvState
 from hasrl_jax.envs.registry import make_task
-from hasrl_jax.errors import ConfigError
+from hasrl_jax.evaluate import report as reports
 from hasrl_jax.evaluate.page import percent
 from hasrl_jax.evaluate.palette import COLORS
 from hasrl_jax.evaluate.rollout import run_episodes
@@ -155,12 +153,10 @@ def write(
     Raises:
       ConfigError: a policy of another task; OSError: the directory cannot be written.
     """
-    for name, (config, _) in policies.items():
-        if not isinstance(config.settings, CassieConfig):
-            raise ConfigError(f"--stairs: {name} is of task {config.task}; only policies that walk can climb")
+    reports.refuse_other_tasks(policies, "--stairs", "policies that walk can climb")
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "stairs.json"
-    earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    earlier = reports.read(path)
     physics_hz = 1 / next(iter(policies.values()))[0].physics.timestep_s
     report: dict[str, Any] = {"trials": trials, "seed": seed, "command": command, "physics_hz": physics_hz}
     report["policies"] = {}
@@ -185,7 +181,7 @@ def write(
             success = share_interval(np.concatenate(parts))
             measured.append(job[0]._asdict() | {"title": job[0].title, "success": success})
             parts = []
-            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            reports.write(report, path)
             write_page(report, directory)
             log.info("%s, %s: %s, %.0f s so far", name, job[0].title, percent(success), time.monotonic() - started)
     write_page(report, directory)
@@ -194,10 +190,7 @@ def write(
 def _digest(config: Config, parameters: Parameters, trials: int, seed: int) -> str:
     """Tells policies apart, and what they are played under."""
     played = [to_dict(row_config(config, row)) for row in rows()]
-    digest = hashlib.sha256(json.dumps([played, trials, seed], sort_keys=True).encode())
-    for name in sorted(parameters):
-        digest.update(name.encode() + parameters[name].tobytes())
-    return digest.hexdigest()
+    return reports.digest([played, trials, seed], parameters)
 
 
 def write_page(report: dict[str, Any], directory: Path) -> None:

@@ -180,12 +180,12 @@ def run_iterations(
         while not ended(parts[0].config, progress) and not distributed.any_process(parts[0].config, bool(stop)):
             part = parts[stages.current]
             config, started = part.config, time.monotonic()
-            if not collector.busy:
-                if collecting != stages.current:
-                    collector.configure(config, part.task)
-                    collecting = stages.current
-                collector.start(acting_parameters(config, learner), progress.iteration, version=progress.iteration)
             try:
+                if not collector.busy:
+                    if collecting != stages.current:
+                        collector.configure(config, part.task)
+                        collecting = stages.current
+                    collector.start(acting_parameters(config, learner), progress.iteration, version=progress.iteration)
                 experience = collector.finish()
             except WorkerError:
                 save_what_is_finished(config, run.checkpoints, RunState(learner, progress))

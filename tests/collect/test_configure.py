@@ -58,11 +58,15 @@ def test_episodes_begin_anew_where_their_state_gets_another_shape(config: Config
 
 
 def test_episodes_begin_anew_under_other_physics(config: Config, parameters: Parameters) -> None:
-    """A robot that was drawn at random carries its physics step, and would keep it."""
+    """A robot that was drawn at random carries its physics step, and would keep it; then as in a pool of that stage."""
     randomized = from_dict(RANDOMIZED, config)
     steps = {"timestep_s": 2 * config.physics.timestep_s, "steps_per_env_step": config.physics.steps_per_env_step // 2}
-    _, coarse = two_iterations(randomized, from_dict({"physics": steps}, randomized), parameters)
+    other = from_dict({"physics": steps}, randomized)
+    _, coarse = two_iterations(randomized, other, parameters)
     assert coarse.fields["is_first"][::8].all()
+    with CpuPool(other, make_plan(other), make_task(other)) as pool:
+        pool.start(parameters, 1, version=1)
+        np.testing.assert_array_equal(coarse.fields["observation"], pool.finish().fields["observation"])
 
 
 def test_free_workers_take_new_settings_over_before_their_next_slot(config: Config, parameters: Parameters) -> None:

@@ -286,8 +286,13 @@ def _with(**changes: Any) -> Config:
 
 
 def test_episodes_go_on_in_another_stage_unless_its_physics_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    rollout = SimpleNamespace(init=lambda seed: {"angle": np.zeros(3)})
-    monkeypatch.setattr(MjxCollector, "_make_rollout", lambda *_: rollout)
+    made = []
+
+    def make_rollout(_: MjxCollector, config: Config, task: Task) -> SimpleNamespace:
+        made.append((config.physics, task))
+        return SimpleNamespace(init=lambda seed: {"angle": np.zeros(3)})
+
+    monkeypatch.setattr(MjxCollector, "_make_rollout", make_rollout)
     config, task = from_dict({"mjx": {"num_envs": 8}}, CONFIG), make_task(CONFIG)
     networks = Networks(*make_networks(CONFIG.network, task.observation_size, task.action_size, task.mirror))
     with MjxCollector(config, task, make_mesh(jax.devices()[:1]), networks) as collector:
@@ -298,8 +303,13 @@ def test_episodes_go_on_in_another_stage_unless_its_physics_differ(monkeypatch: 
             "timestep_s": config.physics.timestep_s / 2,
             "steps_per_env_step": 2 * config.physics.steps_per_env_step,
         }
-        collector.configure(from_dict({"physics": finer}, config), task)
+        other = from_dict({"physics": finer}, config)
+        collector.configure(other, finer_task := make_task(other))
         np.testing.assert_array_equal(collector.state["angle"], 0.0)
+        assert made[-1] == (other.physics, finer_task)
+        collector.state = {"angle": np.ones(3)}
+        collector.configure(other, finer_task)  # the stage after it has the same physics
+        np.testing.assert_array_equal(collector.state["angle"], 1.0)
 
 
 def test_the_plan_fills_whole_minibatches() -> None:

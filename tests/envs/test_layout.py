@@ -47,6 +47,6 @@ def test_places_and_defaults_by_hand() -> None:
     index, sign = layout.signed_permutation((one, two))
     np.testing.assert_array_equal(index, [0, 1, 2, 5, 6, 3, 4])
     np.testing.assert_array_equal(sign, [1, -1, 1, 1, -1, 1, -1])
-    assert (one.legs, one.mean, one.std, two.noise) == (False, 0.0, 1.0, 0.0)
+    assert (one.legs, one.mean, one.std, one.scale, two.noise) == (False, 0.0, 1.0, 1.0, 0.0)
     x, y = np.arange(6.0).reshape(2, 3), np.arange(6.0, 12).reshape(2, 3)
     np.testing.assert_array_equal(layout.columns([x, y], np), np.stack([x, y], axis=-1))

@@ -55,8 +55,8 @@ def test_who_does_exactly_as_the_reference_has_no_error() -> None:
 @pytest.mark.parametrize(
     ("term", "changes", "expected"),
     [
-        # The right knee, weight 0.05, off by 0.2 rad, and the left hip roll, weight 0.15, by 0.1.
-        ("joints", {"motors": np.linspace(-1, 1, 10)[None] + [[0.1, 0, 0, 0, 0, 0, 0, 0, 0.2, 0]]}, 0.0015 + 0.002),
+        # Off by 0.1, 0.2, ... 1 rad; of a leg 0.15 roll^2 + 0.15 yaw^2 + 0.1 pitch^2 + 0.05 knee^2 + 0.05 foot^2.
+        ("joints", {"motors": np.linspace(-1, 1, 10)[None] + 0.1 * np.arange(1, 11)}, 0.037 + 0.282),
         ("springs", {"springs": np.array([[0.13, -0.14]])}, 0.0009 + 0.0016),
         ("center_of_mass", {"position": np.array([[0.31, 0.38, 0.7]])}, 0.09 + 0.16 + 0.04),
         ("path", {"position": np.array([[0.31, 0.38, 0.7]])}, 0.09 + 0.16),

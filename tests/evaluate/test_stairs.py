@@ -1,12 +1,14 @@
 """Trials on stairs: what a row plays, where a trial succeeds, and a small page through the command line."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hasrl_jax.cli.evaluate import main as evaluate_main
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.registry import make_task
@@ -27,8 +29,11 @@ def test_rows_cover_speeds_heights_and_other_ground() -> None:
 
 
 def test_a_row_sets_the_ground_and_leaves_what_the_policy_sees() -> None:
-    trained = shipped("cassie_stairs")
+    other = {"motor": {"torque_speed_curve": False}, "push": {"force_n": [50, 90]}, "terrain": {"level_share": 0.5}}
+    trained = from_dict({"cassie": other}, shipped("cassie_stairs"))
     config = stairs.row_config(trained, Row("down", 0.5, 0.2))
+    assert config.cassie.motor.torque_speed_curve
+    assert (config.cassie.push.force_n, config.cassie.terrain.level_share) == ((0.0, 0.0), 0.0)
     assert config.cassie.observe == "blind" and config.cassie.clock == trained.cassie.clock
     assert config.cassie.terrain.step_height_m == (-0.2, -0.2) and config.cassie.terrain.steps == (1, 8)
     assert config.cassie.command.forward_m_s == (0.5, 0.5)
@@ -83,6 +88,25 @@ def test_a_small_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stairs, "play", nothing)
     assert evaluate_main([*arguments, "--physics", "training"]) == 0
     assert json.loads((tmp_path / "stairs.json").read_text())["policies"] == report["policies"]
+
+
+def test_rows_of_other_trials_and_what_cannot_be_read_are_measured_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = []
+
+    def always_succeed(_: object, jobs: list) -> Iterator[np.ndarray]:
+        for job in jobs:
+            measured.append(job)
+            yield np.ones(job[3], bool)
+
+    monkeypatch.setattr(stairs, "rows", lambda: [Row("level")])
+    monkeypatch.setattr(stairs, "in_processes", always_succeed)
+    policies = {"zero": loading.load_baseline("zero", from_dict({}))}
+    (tmp_path / "stairs.json").write_text('{"policies": {"zero": ')  # cut short
+    for trials, seed, expected in ((3, 0, 1), (3, 0, 1), (4, 0, 2), (4, 1, 3)):
+        stairs.write(tmp_path, policies, trials, seed, "")
+        assert len(measured) == expected
 
 
 @pytest.mark.parametrize(

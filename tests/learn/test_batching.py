@@ -49,7 +49,13 @@ def test_a_segment_without_steps_is_a_row_of_padding() -> None:
 
 @pytest.mark.parametrize(
     ("starts", "ends", "rows", "message"),
-    [([0, 1, 2], [1, 2, 3], 2, "rows"), ([0], [9], 2, "max_length"), ([8], [11], 2, "inside a buffer")],
+    [
+        ([0, 1, 2], [1, 2, 3], 2, "rows"),
+        ([0], [9], 2, "max_length"),
+        ([8], [11], 2, "inside a buffer"),
+        ([-1], [1], 2, "inside a buffer"),
+        ([3], [2], 2, "inside a buffer"),
+    ],
 )
 def test_pad_segments_rejects(starts: list[int], ends: list[int], rows: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -11,6 +11,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from hasrl_jax.config.schema import RayConfig
 from hasrl_jax.errors import ConfigError, WorkerError
 from hasrl_jax.policy.blas import ONE_THREAD, blas_variables
@@ -87,7 +89,7 @@ def connect(ray: Any, settings: RayConfig, num_workers: int, bytes_per_worker: i
             # Ray forks, and JAX warns of it; but the children only set their signals before they become programs.
             warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
             ray.init(**where, **quiet)
-    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except Exception as error:  # of a start that takes too long Ray says so with a bare one
         reason = " ".join(str(error).split())[:300]
         place = f"ray.address: {settings.address} cannot be joined" if settings.address else "Ray does not start here"
         raise WorkerError(f"{place} ({reason})") from None
@@ -104,3 +106,20 @@ def _require_answer(address: str) -> None:
         socket.create_connection((host, int(port)), ANSWER_TIMEOUT_S).close()
     except OSError as error:
         raise WorkerError(f"ray.address: {address} cannot be joined ({error.strerror or error})") from None
+
+
+def find_raylet(ray: Any) -> psutil.Process | None:
+    """Ray's own process on this node; None where it cannot be seen."""
+    node = ray.get_runtime_context().get_node_id()
+    for process in psutil.process_iter(["name", "cmdline"]):
+        if process.info["name"] == "raylet" and any(node in part for part in process.info["cmdline"] or ()):
+            return process
+    return None
+
+
+def has_ended(process: psutil.Process) -> bool:
+    """Also of a process that waits for its parent to notice."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True

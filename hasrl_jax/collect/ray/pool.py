@@ -4,9 +4,12 @@ Parameters go into Ray's object store once per iteration and trajectories come b
 without a copy. Ray's own restarts are not used, since a lost worker is counted, and begins new episodes.
 """
 
+import atexit
 import contextlib
 import logging
+import os
 import re
+import signal
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -16,7 +19,7 @@ import numpy as np
 from hasrl_jax.collect import shared_memory
 from hasrl_jax.collect.buffer import Collected, merge
 from hasrl_jax.collect.plan import Plan
-from hasrl_jax.collect.ray.cluster import connect, environment, import_ray
+from hasrl_jax.collect.ray.cluster import connect, environment, find_raylet, has_ended, import_ray
 from hasrl_jax.collect.ray.worker import RayWorker
 from hasrl_jax.collect.supervisor import MAX_FAILURES, are_of_all_workers, warn_unless_loaded
 from hasrl_jax.config.convert import to_dict
@@ -59,6 +62,7 @@ class RayPool:
         specs = shared_memory.worker_slot_specs(config, plan, task.observation_size, task.action_size)
         self.ray = import_ray(config.ray)
         self._connected = connect(self.ray, config.ray, plan.num_workers, shared_memory.size_of(specs))
+        self._raylet = find_raylet(self.ray)
         try:
             options = {"num_cpus": 1, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
             options |= {"concurrency_groups": {HEARTBEAT: 1}, "runtime_env": environment(config.ray)}
@@ -89,6 +93,7 @@ class RayPool:
         """
         self._version, self._started = version, time.monotonic()
         self._join()
+        self._require_raylet()
         shared = self.ray.put(parameters)
         self._requests = {self._actors[index].collect.remote(shared, iteration): index for index in sorted(self.places)}
         self.busy = True
@@ -99,14 +104,14 @@ class RayPool:
         A worker or node that dies or falls silent is replaced; only its own part of this iteration is lost.
 
         Raises:
-          WorkerError: no worker finished, or one failed too many times in a row.
+          WorkerError: no worker finished, one failed too many times in a row, or Ray's process on this node died.
         """
         finished: dict[int, tuple[dict[str, np.ndarray], dict[str, Any]]] = {}
         cause: str | None = None
         heard = dict.fromkeys(self._requests.values(), time.monotonic())
         asked: dict[int, Any] = {}
         while self._requests:
-            for request in self.ray.wait(list(self._requests), timeout=TICK_S)[0]:
+            for request in self._wait(self._requests, TICK_S):
                 index = self._requests.pop(request)
                 reply, failure = self._receive(index, request)
                 if failure is None:
@@ -166,6 +171,9 @@ class RayPool:
 
     def close(self) -> None:
         """Ends the workers, and Ray if it was started here; a cluster that was joined goes on without them."""
+        if self._raylet is not None and has_ended(self._raylet):
+            self._end_local_workers()
+            return
         if self.ray.is_initialized():
             for actor in self._actors.values():
                 with contextlib.suppress(self.ray.exceptions.RayError):
@@ -203,7 +211,7 @@ class RayPool:
         deadline = time.monotonic() + self.config.collect.worker_start_timeout_s
         while self._starting:
             timeout = 0.0 if self.places else max(0.0, deadline - time.monotonic())
-            ready, _ = self.ray.wait(list(self._starting), timeout=timeout)
+            ready = self._wait(self._starting, timeout)
             if not ready:
                 break
             index = self._starting.pop(ready[0])
@@ -217,8 +225,34 @@ class RayPool:
             limit = f"collect.worker_start_timeout_s={self.config.collect.worker_start_timeout_s:g} s"
             raise WorkerError(f"every worker was lost, and no other started within {limit}")
 
+    def _require_raylet(self) -> None:
+        """Asked before Ray is: without its process on this node it ends this one, unsaved, at the next request.
+
+        Raises:
+          WorkerError: that process has died.
+        """
+        if self._raylet is not None and has_ended(self._raylet):
+            raise WorkerError("Ray's process on this machine, the raylet, has died, and all workers with it")
+
+    def _end_local_workers(self) -> None:
+        """Without a word to Ray, which would end this process before it has said why, and repeat itself at its end."""
+        atexit.unregister(self.ray.shutdown)
+        own = self.ray.get_runtime_context().get_node_id()
+        for node, process_id in self.places.values():
+            if node == own:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process_id, signal.SIGKILL)
+
+    def _wait(self, requests: Iterable[Any], timeout: float) -> list[Any]:
+        """Those that are answered; at most one, after `timeout` seconds none."""
+        self._require_raylet()
+        ready, _ = self.ray.wait(list(requests), timeout=timeout)
+        self._require_raylet()
+        return ready
+
     def _receive(self, index: int, request: Any) -> tuple[Any, str | None]:
         """A worker's reply, and how it failed if it did."""
+        self._require_raylet()
         try:
             return self.ray.get(request, timeout=self.config.collect.worker_timeout_s), None
         except self.ray.exceptions.GetTimeoutError:
