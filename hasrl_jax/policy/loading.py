@@ -36,7 +36,7 @@ RELEASED_SHA256 = {
     "released": "a848c5a08b333bcc5d869a874a3b3bdbe69af6a580e4a3739e6c992f393d575f",
     "released-steer": "46a840064f5ea73b65d25d8d87e1267deb120e56ca8efa43a0d11f97af03a8a8",
     "released-fast": "fa793bf329a7969197ccc8d0ec9c56dd131208adef00b21cec31acc281d43722",
-    "released-stairs": "08154efe70f6ef10500cb58af1975e42eb9804834d33809cef6587bb9e747955",
+    "released-stairs": "926daae42a0574c42803f9fd5b3fd5cdc8622f4b7cace6329c088de929903590",
     "released-imitate": "404d32723b025372d7d04b97b978f70472b63510093d9747041f9dcd8ec9c68c",
 }
 
