@@ -19,7 +19,7 @@ def main(argv: list[str] | None = None) -> int:
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--policy", default="released-fast", help="released-fast (default), released, released-steer, -stairs or -imitate"
+        "--policy", default="released-fast", help="released-fast (default), released or another of the package"
     )
     parser.add_argument("--headless", action="store_true", help="write a film instead of opening a page")
     parser.add_argument("--out", type=Path, default=Path("demo.mp4"), help="the film of --headless")

@@ -13,9 +13,9 @@ from hasrl_jax.errors import CheckpointError
 from hasrl_jax.learn import ppo
 from hasrl_jax.policy.loading import policy_metadata
 from hasrl_jax.runs import checkpoint
+from hasrl_jax.runs.directory import FILMS_DIRECTORY
 
 log = logging.getLogger("hasrl_jax")
-FILMS_DIRECTORY = "films"
 LAST_FILM_S = 120.0  # how long the end of a run waits for a film that is being made
 
 
