@@ -36,7 +36,7 @@ def _poses(task: Task, count: int) -> list[mujoco.MjData]:
 
 def _encoders(task: Task, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
     ids = cassie_ids(task.model)
-    qpos, qvel = [*ids.motor_qpos, *ids.passive_qpos], [*ids.motor_qvel, *ids.passive_qvel]
+    qpos, qvel = ids.encoder_qpos, ids.encoder_qvel
     return data.qpos[qpos], data.qvel[qvel]
 
 

@@ -24,7 +24,6 @@ class CassieIds(NamedTuple):
     motor_qpos: np.ndarray  # [10]
     motor_qvel: np.ndarray  # [10]
     passive_qpos: np.ndarray  # [6]
-    passive_qvel: np.ndarray  # [6]
     encoder_qpos: np.ndarray  # [16] of the motors and the passive joints
     encoder_qvel: np.ndarray  # [16]
     hip_roll_qvel: Place  # [2]
@@ -68,7 +67,6 @@ def cassie_ids(
         motor_qpos=np.array([joint.qposadr[0] for joint in motors]),
         motor_qvel=np.array([joint.dofadr[0] for joint in motors]),
         passive_qpos=np.array([joint.qposadr[0] for joint in passive]),
-        passive_qvel=np.array([joint.dofadr[0] for joint in passive]),
         encoder_qpos=np.array([joint.qposadr[0] for joint in encoders]),
         encoder_qvel=np.array([joint.dofadr[0] for joint in encoders]),
         hip_roll_qvel=evenly_spaced(np.array([motors[0].dofadr[0], motors[5].dofadr[0]])),

@@ -52,7 +52,7 @@ def legs(model: mujoco.MjModel, ids: CassieIds, joints: Mapping[str, str] = NO_N
     Raises:
       ConfigError: a hinge between pelvis and foot has no encoder, or the sole is no capsule.
     """
-    encoders = [*ids.motor_qpos, *ids.passive_qpos]
+    encoders = ids.encoder_qpos.tolist()
     chains = [_chain(model, encoders, joints.get(f"{side}-foot", f"{side}-foot")) for side in SIDES]
     both = {name: np.stack([chain[name] for chain in chains]) for name in chains[0]}
     along = {name: np.moveaxis(both[name], 1, 0) for name in ("position", "frame", "axis")}
