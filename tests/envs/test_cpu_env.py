@@ -170,15 +170,17 @@ def test_restored_environments_go_on_identically() -> None:
 
 @pytest.mark.parametrize("config", [{}, DISTURBED], ids=["default", "disturbed"])
 @pytest.mark.parametrize("num_envs", [2, SPLIT_FROM])
-def test_the_batch_equals_plain_mujoco(num_envs: int, config: dict[str, Any]) -> None:
+@pytest.mark.parametrize("held", [True, False], ids=["held", "changing"])
+def test_the_batch_equals_plain_mujoco(held: bool, num_envs: int, config: dict[str, Any]) -> None:
     task = make_task(from_dict(config))
     envs = CpuEnvs(task, num_envs, 100)
     rng = np.random.default_rng(3)
     state = envs.reset(rng)
     state, _ = envs.step(state, rng.uniform(-0.5, 0.5, (num_envs, 10)), rng)
     assert state.physics[:, 1 + task.model.nq + task.model.nv :].any() == bool(config)  # what lags in actuators
-    control = task.control(state.task, rng.uniform(-0.5, 0.5, (num_envs, 10)), np)
-    end, reading, warned = envs._simulate(state, control[:, None])
+    actions = rng.uniform(-0.5, 0.5, (1 if held else task.steps_per_env_step, num_envs, 10))
+    control = np.stack([task.control(state.task, action, np) for action in actions], axis=1)
+    end, reading, warned = envs._simulate(state, control)
     assert not warned.any()
     for env in (0, num_envs - 1):
         model = make_task(from_dict(config)).model
@@ -188,9 +190,9 @@ def test_the_batch_equals_plain_mujoco(num_envs: int, config: dict[str, Any]) ->
             getattr(model, name)[:] = state.model_fields[name][env]
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state.physics[env], mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        data.ctrl[:] = control[env]
         features = []
-        for _ in range(task.steps_per_env_step):
+        for step in range(task.steps_per_env_step):
+            data.ctrl[:] = control[env, 0 if held else step]
             mujoco.mj_step(model, data)
             features.append(task.physics_features(data.sensordata.copy(), np))
         np.testing.assert_array_equal(end[env], [data.time, *data.qpos, *data.qvel, *data.act])
