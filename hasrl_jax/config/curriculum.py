@@ -25,7 +25,8 @@ from hasrl_jax.config.schema import Config, StageConfig
 from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Record
 
-CHANGEABLE = ("physics", "ppo", "evaluate")  # what a stage may change besides the task's own settings
+# what a stage may change besides the task's own settings
+CHANGEABLE = ("physics", "ppo", "evaluate", "network.initial_log_std")
 WINDOW = 10  # values of a metric that are averaged
 NOW_AND_THEN = "eval_"  # how the metrics begin that not every iteration has
 
@@ -72,8 +73,8 @@ class Stages:
         names = {name for stage in stages for name in stage.wait_for}
         self._history = {name: deque(history.get(name, ()), maxlen=WINDOW) for name in sorted(names)}
 
-    def advance(self, env_steps: int, record: Record) -> bool:
-        """Takes the metrics of an iteration; whether another stage has begun with it. One iteration, one stage.
+    def reached(self, env_steps: int, record: Record) -> bool:
+        """Takes the metrics of an iteration; whether another stage begins with it. One iteration, one stage.
 
         Raises:
           ConfigError: a stage waits for a metric that there is none of.
@@ -87,14 +88,14 @@ class Stages:
         if self.current == len(self._stages):
             return False
         stage = self._stages[self.current]
-        reached = all(
+        return env_steps >= stage.at_env_steps and all(
             len(self._history[name]) == WINDOW and np.mean(self._history[name]) >= least
             for name, least in stage.wait_for.items()
         )
-        if env_steps < stage.at_env_steps or not reached:
-            return False
+
+    def begin(self) -> None:
+        """The stage that was reached begins."""
         self.current += 1
-        return True
 
     def due(self, env_steps: int) -> bool:
         """Whether the next stage begins after the present iteration, whatever its metrics."""
@@ -109,18 +110,17 @@ class Stages:
 
 def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
     """`config` with some fields replaced, and checked."""
-    env_step_s = config.physics.env_step_s
+    before, env_step_s = config, config.physics.env_step_s
     changeable = (*([config.section] if config.section else []), *CHANGEABLE)
     fields = [field for part in changes.items() for field in flat(dict([part]))]
     for field in fields:
         if fields.count(field) > 1:
             raise ConfigError(f"{name}.set: {named(field)} is given twice")
-    for field, value in changes.items():
-        parts = field.split(".")
-        if parts[0] not in changeable:
+        if not any(field == known or field.startswith(f"{known}.") for known in changeable):
             which = ", ".join(changeable)
             raise ConfigError(f"{name}.set: {named(field)} cannot change during a run; {which} settings can")
-        for part in reversed(parts):
+    for field, value in changes.items():
+        for part in reversed(field.split(".")):
             value = {part: value}
         try:
             config = from_dict(value, config)
@@ -130,6 +130,8 @@ def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
         check(config)
     except ConfigError as error:
         raise ConfigError(f"{name}.set: {error}") from None
+    if config.network.learn_std and config.network != before.network:
+        raise ConfigError(f"{name}.set: network.initial_log_std: a stage can set it where network.learn_std is false")
     if not np.isclose(config.physics.env_step_s, env_step_s):
         raise ConfigError(
             f"{name}.set: physics.timestep_s times steps_per_env_step is {config.physics.env_step_s:g} s; expected "

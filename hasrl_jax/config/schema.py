@@ -39,7 +39,7 @@ class NetworkConfig:
     memory: Literal["lstm", "none"] = "lstm"
     hidden_size: Annotated[int, Limits(1, 8192)] = 128  # width of each policy layer and of each value layer
     initial_log_std: Annotated[float, Limits(-10, 3)] = 0.0  # log of the exploration standard deviation at the start
-    learn_std: bool = True  # train the standard deviation; otherwise it stays at its start
+    learn_std: bool = True  # train the standard deviation; otherwise it stays at its start, or what a stage sets
     normalize_observations: bool = True  # running mean and variance, part of the checkpoint
     symmetric: bool = False  # mirror-equivariant policy and mirror-invariant value by construction
 

@@ -107,6 +107,18 @@ def init_learner(
     return jax.jit(create)(key)  # one program starts sooner than its operations one by one
 
 
+def with_deviation(state: LearnerState, log_std: float) -> LearnerState:
+    """`state` with a policy that explores with another standard deviation, one for all actions.
+
+    Args:
+      state: where `network.learn_std` is false, so no gradient moves the deviation.
+      log_std: its logarithm.
+    """
+    before = state.policy_params["log_std"]
+    after = jax.device_put(np.full(before.shape, log_std, before.dtype), before.sharding)
+    return state._replace(policy_params={**state.policy_params, "log_std": after})
+
+
 def acting_parameters(state: LearnerState, normalize_observations: bool = True) -> dict[str, jax.Array]:
     """What a collector needs to act, where the learner keeps it.
 

@@ -218,8 +218,10 @@ def run_iterations(
             except RunError:
                 save_what_is_finished(config, run.checkpoints, RunState(learner, progress))
                 raise
-            if distributed.first_process(config, stages.advance(progress.env_steps, record)):
+            if distributed.first_process(config, stages.reached(progress.env_steps, record)):
+                stages.begin()
                 log.info("stage %d begins at %s environment steps", stages.current, f"{progress.env_steps:,}")
+                learner = begin_stage(learner, config, parts[stages.current].config)
             progress = progress._replace(stage=stages.current, history=stages.history)
             if due(progress.iteration, config.checkpoint.every_iterations):
                 save(config, run.checkpoints, RunState(learner, progress, collector.save()))
@@ -227,6 +229,13 @@ def run_iterations(
         if not due(progress.iteration, parts[0].config.checkpoint.every_iterations):
             save(parts[0].config, run.checkpoints, state)
     return state
+
+
+def begin_stage(learner: ppo.LearnerState, before: Config, after: Config) -> ppo.LearnerState:
+    """The learner under the settings of another stage, of which it holds one itself."""
+    if after.network.initial_log_std == before.network.initial_log_std:
+        return learner  # which may have begun with another, that of `--init-policy`
+    return ppo.with_deviation(learner, after.network.initial_log_std)
 
 
 def ended(config: Config, progress: Progress) -> bool:

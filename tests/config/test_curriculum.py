@@ -39,20 +39,28 @@ def test_without_stages_there_is_one_part() -> None:
     assert curriculum.resolve(from_dict({})) == [from_dict({})]
 
 
+def advance(stages: Stages, env_steps: int, record: dict) -> bool:
+    """Whether another stage has begun, as a run does it."""
+    reached = stages.reached(env_steps, record)
+    if reached:
+        stages.begin()
+    return reached
+
+
 def test_stages_begin_one_after_the_other_at_their_steps() -> None:
     stages = Stages(from_dict({"stages": STAGES}).stages, 0, {})
-    assert [stages.advance(steps, {}) for steps in (999, 1000, 1999, 2000, 9999)] == [False, True, False, True, False]
+    assert [advance(stages, steps, {}) for steps in (999, 1000, 1999, 2000, 9999)] == [False, True, False, True, False]
     assert stages.current == 2
     behind = Stages(from_dict({"stages": STAGES}).stages, 0, {})
-    assert [behind.advance(5000, {}) for _ in range(3)] == [True, True, False]  # both are over, one an iteration
+    assert [advance(behind, 5000, {}) for _ in range(3)] == [True, True, False]  # both are over, one an iteration
 
 
 def test_a_stage_waits_for_the_mean_of_a_metric_and_holds_up_those_behind_it() -> None:
     stages = Stages(from_dict({"stages": WAITING}).stages, 0, {})
     for value in [None] + [49.0] * WINDOW:
-        assert not stages.advance(3000, {"episode_length_train": value})
+        assert not advance(stages, 3000, {"episode_length_train": value})
         assert not stages.due(3000)
-    assert [stages.advance(3000, {"episode_length_train": 51.0}) for _ in range(5)] == [False] * 4 + [True]
+    assert [advance(stages, 3000, {"episode_length_train": 51.0}) for _ in range(5)] == [False] * 4 + [True]
     assert stages.due(3000)  # the one behind it waits for nothing
     assert stages.current == 1
 
@@ -61,15 +69,15 @@ def test_what_a_stage_waits_for_outlives_a_break() -> None:
     configured = from_dict({"stages": WAITING}).stages
     before = Stages(configured, 0, {})
     for _ in range(WINDOW - 1):
-        before.advance(3000, {"episode_length_train": 60.0})
+        advance(before, 3000, {"episode_length_train": 60.0})
     after = Stages(configured, before.current, before.history)
-    assert after.advance(3000, {"episode_length_train": 60.0})
+    assert advance(after, 3000, {"episode_length_train": 60.0})
 
 
 def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
     stages = Stages(from_dict({"stages": [WAITING[0] | {"wait_for": {"episode_lenght": 1.0}}]}).stages, 0, {})
     with pytest.raises(ConfigError, match=r"wait_for names 'episode_lenght', which is no metric; known are iteration"):
-        stages.advance(10, {"iteration": 1})
+        advance(stages, 10, {"iteration": 1})
 
 
 @pytest.mark.parametrize(
@@ -85,6 +93,11 @@ def test_an_unknown_metric_is_refused_at_the_first_iteration() -> None:
             r"stages\[0\].set: physics.timestep_s times steps_per_env_step is 0.05 s; expected 0.025 s, as before",
         ),
         ([{"at_env_steps": 100, "set": {"network.hidden_size": 4}}], r"network.hidden_size cannot change during a run"),
+        ([{"at_env_steps": 100, "set": {"network": {"learn_std": False}}}], r"learn_std cannot change during a"),
+        (
+            [{"at_env_steps": 100, "set": {"network.initial_log_std": -1.0}}],
+            r"stages\[0\].set: network.initial_log_std: a stage can set it where network.learn_std is false",
+        ),
         ([{"at_env_steps": 100, "set": {"cassie.push.force": [0, 1]}}], r"config.cassie.push.force: unknown field"),
         ([{"at_env_steps": 100, "set": {"cassie.push.force_n": [5, 1]}}], r"cassie.push.force_n: got .* low <= high"),
         ([{"at_env_steps": 9, "set": {"ppo.clip": 0.1, "ppo": {"clip": 0.2}}}], r"set: ppo.clip is given twice"),

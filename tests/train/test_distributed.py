@@ -18,6 +18,7 @@ from hasrl_jax.cli import parsing as cli
 from hasrl_jax.cli.train import main as train_main
 from hasrl_jax.collect.plan import make_plan
 from hasrl_jax.config.convert import from_dict
+from hasrl_jax.config.curriculum import WINDOW
 from hasrl_jax.config.schema import DistributedConfig
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.errors import ConfigError
@@ -29,6 +30,15 @@ from hasrl_jax.train import loop as train
 
 SCRIPT = Path(two_processes.__file__)
 TINY = tiny_yaml(collect={"num_workers": 1}, ppo={"epochs": 2}, total_env_steps=256)
+# The first process alone evaluates, so it alone sees when the stage is reached.
+STAGED = tiny_yaml(
+    collect={"num_workers": 1},
+    ppo={"policy_learning_rate": 1e-5},
+    network={"learn_std": False},
+    evaluate={"every_iterations": 1},
+    stages=[{"at_env_steps": 128, "wait_for": {"eval_length": 1.0}, "set": {"network.initial_log_std": -2.0}}],
+    total_env_steps=(WINDOW + 2) * 128,
+)
 
 
 def free_address() -> str:
@@ -74,7 +84,7 @@ def test_two_processes_with_half_a_batch_each_update_as_one_with_the_whole(tmp_p
 
 def test_the_command_in_two_processes_is_one_run(tmp_path, monkeypatch):
     """It ends with the parameters of one process that has the workers of both, in one run directory."""
-    (tmp_path / "tiny.yaml").write_text(TINY)
+    (tmp_path / "tiny.yaml").write_text(STAGED)
     run, other, alone = tmp_path / "runs" / "both", tmp_path / "other", tmp_path / "alone"
     arguments = ["--config", tmp_path / "tiny.yaml", "--run-dir", run]
     arguments += ["--distributed.coordinator", free_address(), "--distributed.num-processes", 2]
@@ -86,12 +96,13 @@ def test_the_command_in_two_processes_is_one_run(tmp_path, monkeypatch):
     ]
     assert train_main(["--config", "tiny.yaml", "--run-dir", str(alone), "--num-workers", "2"]) == 0
     first, second = outputs(processes)
-    assert first.count("\niteration") == 2
+    assert first.count("\niteration") == WINDOW + 2
     assert "iteration" not in second
     assert [path.name for path in run.parent.iterdir()] == ["both"]
     lines = [(path / "metrics.jsonl").read_text().splitlines() for path in (run, alone)]
     records = [[json.loads(line) for line in text] for text in lines]
-    assert [record["env_steps"] for record in records[0]] == [128, 256]
+    assert [record["env_steps"] for record in records[0]] == [128 * (1 + index) for index in range(WINDOW + 2)]
+    assert [record["stage"] for record in records[0]] == [0] * WINDOW + [1] * 2
     for both, single in zip(*records, strict=True):
         assert both["actor_loss"] == pytest.approx(single["actor_loss"], rel=1e-3, abs=1e-5)
     of_other = dict(np.load(other.with_suffix(".npz")))

@@ -165,14 +165,18 @@ def test_a_walking_run_goes_on_bit_for_bit(tmp_path):
 
 
 def test_a_curriculum_changes_settings_on_the_way_and_survives_a_break(tmp_path, tiny):
-    stages = "[{at_env_steps: 256, set: {ppo.policy_learning_rate: 1e-5}}, {at_env_steps: 384, set: {ppo.clip: 0.1}}]"
-    tiny.write_text(f"{TINY}stages: {stages}\n")
+    stages = [
+        {"at_env_steps": 256, "set": {"ppo.policy_learning_rate": 1e-5}},
+        {"at_env_steps": 384, "set": {"network.initial_log_std": -2.0}},
+    ]
+    tiny.write_text(tiny_yaml(network={"learn_std": False}, stages=stages))
     assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "whole")]) == 0
     assert train_main(["--config", str(tiny), "--run-dir", str(tmp_path / "parts"), "--total-env-steps", "384"]) == 0
     assert train_main(["--resume", str(tmp_path / "parts"), "--total-env-steps", "512"]) == 0
     whole = untimed(tmp_path / "whole")
     np.testing.assert_allclose([record["learning_rate"] for record in whole], [3e-4, 3e-4, 1e-5, 1e-5], rtol=1e-6)
     assert [record["stage"] for record in whole] == [0, 0, 1, 2]
+    np.testing.assert_allclose([record["std_mean"] for record in whole], np.exp([-1, -1, -1, -2]), rtol=1e-6)
     assert without_evaluations(whole) == without_evaluations(untimed(tmp_path / "parts"))
 
 
