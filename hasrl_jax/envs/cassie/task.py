@@ -527,6 +527,8 @@ def step(
     told = commands.named(state.command, config.command)
     state = follow(constants, state, reading.qpos, xp)
     motion = motion_of(constants, state, reading, xp)
+    along, across = next_lag(state, told, motion, config.termination.lag_memory_s, xp)
+    state = state._replace(lag=layout.columns([along, across], xp))
     errors = reward_errors(constants, state, told, action, reading, motion, xp)
     terms = rewards.weighted_terms(errors, constants.reward_weights, xp)
     compared = None
@@ -541,7 +543,6 @@ def step(
     terminated = terminated | (layout.numbers(motion.up)[2] < constants.least_upright)
     if compared is not None and config.reference.min_reward > 0:
         terminated = terminated | (compared.sum(axis=-1) < config.reference.min_reward)
-    along, across = next_lag(state, told, motion, limits.lag_memory_s, xp)
     terminated = terminated | (along * along + across * across > limits.max_lag_m**2)
     yaw = frames.heading(reading.qpos[..., 3:7], xp)
     measured = [motion.forward, motion.lateral, told["forward"], told["lateral"], motion.height, yaw]
@@ -568,7 +569,6 @@ def step(
     state = state._replace(
         phase=following_phase(constants, state, xp),
         standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
-        lag=layout.columns([along, across], xp),
         command=command,
         command_s=command_s,
         push=push,
@@ -798,7 +798,7 @@ def reward_errors(
     motion: Motion,
     xp: Any,
 ) -> dict[str, Array]:
-    """The scores and errors of paper Table I by term name, each [...]."""
+    """The scores and errors of paper Table I by term name, each [...]; the lag is that at the end of the step."""
     config, ids = constants.config, constants.ids
     settings = config.reward
     speed = told["forward"]
@@ -812,6 +812,10 @@ def reward_errors(
     w = layout.numbers(motion.orientation)[0]
     pelvis_error = 1.0 - w * w  # `quaternion_error` from the upright pose (1, 0, 0, 0)
     forward_error, lateral_error = abs(motion.forward - speed), abs(motion.lateral - told["lateral"])
+    if share := settings.velocity_mean_share:
+        along, across = (abs(lag) / config.termination.lag_memory_s for lag in layout.numbers(state.lag))
+        forward_error = forward_error + share * (along - forward_error)
+        lateral_error = lateral_error + share * (across - lateral_error)
     speed_error = forward_error + settings.lateral_velocity_share * lateral_error
     if config.command.frame == "world":
         drift = layout.numbers(reading.qpos[..., :2])[1]
