@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hasrl_jax.config.convert import flat, from_dict, to_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie.settings import CassieConfig
 from hasrl_jax.errors import ConfigError
@@ -28,12 +30,27 @@ def write(report: dict[str, Any], path: Path) -> None:
     durable.replace(partial, path)
 
 
-def digest(played: Any, parameters: Parameters) -> str:
-    """Tells policies apart, and what they are played under. `played`: ready for JSON."""
-    found = hashlib.sha256(json.dumps(played, sort_keys=True).encode())
+def digest(configs: Iterable[Config], revision: int, parameters: Parameters) -> str:
+    """Tells policies apart, and what they are played under.
+
+    Args:
+      configs: under which they are played; settings at their defaults do not count, so that one more changes nothing.
+      revision: of what the rows are.
+      parameters: of the policy.
+    """
+    played = [_departures(config) for config in configs]
+    found = hashlib.sha256(json.dumps([revision, played], sort_keys=True).encode())
     for name in sorted(parameters):
         found.update(name.encode() + parameters[name].tobytes())
     return found.hexdigest()
+
+
+def _departures(config: Config) -> dict[str, Any]:
+    """The settings of the task, the physics and the networks that are not the defaults, by their dotted names."""
+    usual = flat(to_dict(from_dict({"task": config.task})))
+    kept = f"{config.section}.", "physics.", "network.", "collect.max_episode_steps"
+    found = flat(to_dict(config))
+    return {name: value for name, value in found.items() if name.startswith(kept) and usual.get(name) != value}
 
 
 def refuse_other_tasks(policies: dict[str, tuple[Config, Parameters]], option: str, who: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config.convert import from_dict, to_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config, available_cores
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
 from hasrl_jax.envs.registry import Robot, make_task, make_task_on
@@ -329,8 +329,7 @@ def refuse_settings(arguments: list[str], what: str = "a scorecard") -> None:
 
 def _digest(config: Config, parameters: Parameters, seconds: float) -> str:
     """Tells policies apart, and what they are played under."""
-    played = [to_dict(row_config(config, row, seconds)) for row in rows(config)]
-    return reports.digest([REVISION, played], parameters)
+    return reports.digest((row_config(config, row, seconds) for row in rows(config)), REVISION, parameters)
 
 
 def measure(

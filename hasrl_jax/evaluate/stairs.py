@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hasrl_jax.config.convert import from_dict, to_dict
+from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.schema import Config
 from hasrl_jax.envs.cassie import terrain
 from hasrl_jax.envs.cassie.settings import RandomizeConfig
@@ -28,6 +28,7 @@ from hasrl_jax.evaluate.statistics import share_interval
 from hasrl_jax.policy.numpy_networks import Parameters
 
 log = logging.getLogger("hasrl_jax")
+REVISION = 1  # of what a trial is; counts made under another are not kept
 SPEEDS_M_S = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 RISES_M = (0.05, 0.1, 0.125, 0.15, 0.175, 0.2)
 AT_RISE_M, AT_SPEED_M_S = 0.15, 0.75  # of the rows in which the other one varies
@@ -141,7 +142,7 @@ def write(
 ) -> None:
     """Measures every policy in every row; writes stairs.json, .md and .png after each row.
 
-    Rows that stairs.json already holds of the same policies, trials and seed are not measured again.
+    Trials that stairs.json already counts of the same policies and seed are not played again: more can be added.
 
     Args:
       directory: made if missing.
@@ -160,43 +161,53 @@ def write(
     physics_hz = 1 / next(iter(policies.values()))[0].physics.timestep_s
     report: dict[str, Any] = {"trials": trials, "seed": seed, "command": command, "physics_hz": physics_hz}
     report["policies"] = {}
+    same = earlier.get("seed") == seed
     for name, (config, parameters) in policies.items():
-        digest = _digest(config, parameters, trials, seed)
-        known = earlier.get("policies", {}).get(name, {})
+        digest = _digest(config, parameters)
+        known = earlier.get("policies", {}).get(name, {}) if same else {}
         fresh = {"digest": digest, "observe": config.settings.observe, "rows": []}
         report["policies"][name] = known if known.get("digest") == digest else fresh
     for name, (config, parameters) in policies.items():
         measured, started = report["policies"][name]["rows"], time.monotonic()
-        chosen = rows()[len(measured) :]
+        played = [_played(row, trials) for row in measured] + [0] * (len(rows()) - len(measured))
         jobs = [
-            (row, row_config(config, row), parameters, min(BATCH, trials - done), [seed, rows().index(row), done])
-            for row in chosen
-            for done in range(0, trials, BATCH)
+            (row, row_config(config, row), parameters, min(BATCH, trials - done), [seed, index, done])
+            for index, row in enumerate(rows())
+            for done in range(played[index], trials, BATCH)
         ]
-        parts: list[np.ndarray] = []
-        for job, part in zip(jobs, in_processes(play, jobs), strict=True):
-            parts.append(part)
-            if sum(map(len, parts)) < trials:
+        parts = in_processes(play, jobs)
+        for index, row in enumerate(rows()):
+            if played[index] == trials:
                 continue
-            success = share_interval(np.concatenate(parts))
-            measured.append(job[0]._asdict() | {"title": job[0].title, "success": success})
-            parts = []
+            successes = round(played[index] * measured[index]["success"]["mean"]) if played[index] else 0
+            successes += sum(int(next(parts).sum()) for _ in range(played[index], trials, BATCH))
+            success = share_interval(np.arange(trials) < successes)
+            measured[index : index + 1] = [row._asdict() | {"title": row.title, "trials": trials, "success": success}]
             reports.write(report, path)
             write_page(report, directory)
-            log.info("%s, %s: %s, %.0f s so far", name, job[0].title, percent(success), time.monotonic() - started)
+            log.info("%s, %s: %s, %.0f s so far", name, row.title, percent(success), time.monotonic() - started)
     write_page(report, directory)
 
 
-def _digest(config: Config, parameters: Parameters, trials: int, seed: int) -> str:
+def _digest(config: Config, parameters: Parameters) -> str:
     """Tells policies apart, and what they are played under."""
-    played = [to_dict(row_config(config, row)) for row in rows()]
-    return reports.digest([played, trials, seed], parameters)
+    return reports.digest((row_config(config, row) for row in rows()), REVISION, parameters)
+
+
+def _played(row: dict[str, Any], trials: int) -> int:
+    """How many trials of a row need not be played again: all, or whole batches of fewer."""
+    known: int = row["trials"]
+    return known if known == trials or (known < trials and known % BATCH == 0) else 0
 
 
 def write_page(report: dict[str, Any], directory: Path) -> None:
     """Writes stairs.md and stairs.png. `report`: as in stairs.json."""
     shares = {
-        name: {Row(**{key: row[key] for key in Row._fields}): row["success"] for row in policy["rows"]}
+        name: {
+            Row(**{key: row[key] for key in Row._fields}): row["success"]
+            for row in policy["rows"]
+            if row["trials"] == report["trials"]
+        }
         for name, policy in report["policies"].items()
     }
     lines = [

@@ -90,23 +90,34 @@ def test_a_small_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert json.loads((tmp_path / "stairs.json").read_text())["policies"] == report["policies"]
 
 
-def test_rows_of_other_trials_and_what_cannot_be_read_are_measured_anew(
+def test_trials_are_added_and_what_cannot_be_read_is_measured_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured = []
 
-    def always_succeed(_: object, jobs: list) -> Iterator[np.ndarray]:
-        for job in jobs:
-            measured.append(job)
-            yield np.ones(job[3], bool)
+    def play(_: object, jobs: list) -> Iterator[np.ndarray]:
+        """All succeed in the first batch, none later."""
+        for _, _, _, trials, seed in jobs:
+            measured.append((trials, seed))
+            yield np.full(trials, seed[-1] == 0)
 
     monkeypatch.setattr(stairs, "rows", lambda: [Row("level")])
-    monkeypatch.setattr(stairs, "in_processes", always_succeed)
+    monkeypatch.setattr(stairs, "in_processes", play)
     policies = {"zero": loading.load_baseline("zero", from_dict({}))}
     (tmp_path / "stairs.json").write_text('{"policies": {"zero": ')  # cut short
-    for trials, seed, expected in ((3, 0, 1), (3, 0, 1), (4, 0, 2), (4, 1, 3)):
+
+    def success(trials: int, seed: int) -> float:
         stairs.write(tmp_path, policies, trials, seed, "")
-        assert len(measured) == expected
+        (row,) = json.loads((tmp_path / "stairs.json").read_text())["policies"]["zero"]["rows"]
+        assert row["trials"] == trials
+        return row["success"]["mean"]
+
+    assert (success(3, 0), measured) == (1.0, [(3, [0, 0, 0])])
+    assert (success(3, 0), len(measured)) == (1.0, 1)  # they are known
+    assert (success(50, 0), measured[1:]) == (0.5, [(25, [0, 0, 0]), (25, [0, 0, 25])])  # 3 are no batch
+    assert (success(75, 0), measured[3:]) == (pytest.approx(25 / 75), [(25, [0, 0, 50])])
+    assert (success(50, 0), len(measured)) == (0.5, 6)  # which 50 of the 75 it were is not known
+    assert (success(50, 1), len(measured)) == (0.5, 8)
 
 
 @pytest.mark.parametrize(
