@@ -103,6 +103,7 @@ class CassieState(NamedTuple):
     command: Array  # [..., C] in the order of `commands.COMMANDS`
     command_s: Array  # [...] seconds until the command is drawn again
     path: Array  # [..., 2] a point that moves as commanded, world x and y, m
+    lateral_error: Array  # [...] lateral speed less the one commanded, or what follows it, m/s
     lag: Array  # [..., 2] distance by which the robot is behind its commands, along and across; fades with time, m
     target_heading: Array  # [...] the heading to keep, rad; 0 in the world frame
     standing: Array  # [...] bool: the clock rests
@@ -377,6 +378,7 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         command=command,
         command_s=command_s,
         path=xp.zeros((*batch, 2)),
+        lateral_error=xp.zeros(batch),
         lag=xp.zeros((*batch, 2)),
         target_heading=yaw,
         standing=is_standing(config, command, qvel[..., :2], xp),
@@ -527,8 +529,7 @@ def step(
     told = commands.named(state.command, config.command)
     state = follow(constants, state, reading.qpos, xp)
     motion = motion_of(constants, state, reading, xp)
-    along, across = next_lag(state, told, motion, config.termination.lag_memory_s, xp)
-    state = state._replace(lag=layout.columns([along, across], xp))
+    state = state._replace(lateral_error=next_lateral_error(constants, state, told, motion, xp))
     errors = reward_errors(constants, state, told, action, reading, motion, xp)
     terms = rewards.weighted_terms(errors, constants.reward_weights, xp)
     compared = None
@@ -543,6 +544,7 @@ def step(
     terminated = terminated | (layout.numbers(motion.up)[2] < constants.least_upright)
     if compared is not None and config.reference.min_reward > 0:
         terminated = terminated | (compared.sum(axis=-1) < config.reference.min_reward)
+    along, across = next_lag(state, told, motion, limits.lag_memory_s, xp)
     terminated = terminated | (along * along + across * across > limits.max_lag_m**2)
     yaw = frames.heading(reading.qpos[..., 3:7], xp)
     measured = [motion.forward, motion.lateral, told["forward"], told["lateral"], motion.height, yaw]
@@ -569,6 +571,7 @@ def step(
     state = state._replace(
         phase=following_phase(constants, state, xp),
         standing=is_standing(config, command, seen_velocity(constants, state, reading.qvel, xp), xp),
+        lag=layout.columns([along, across], xp),
         command=command,
         command_s=command_s,
         push=push,
@@ -664,6 +667,16 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
     drift = xp.stack([xp.zeros_like(target), xp.clip(drift[..., 1], -config.max_drift_m, config.max_drift_m)], axis=-1)
     return state._replace(path=qpos[..., :2] + frames.turned(drift, target, xp), target_heading=target)
+
+
+def next_lateral_error(
+    constants: Constants, state: CassieState, told: dict[str, Array], motion: Motion, xp: Any
+) -> Array:
+    """The lateral speed error of the reward after an environment step, m/s, [...]: e' = e + share (now - e)."""
+    now, memory_s = motion.lateral - told["lateral"], constants.config.reward.lateral_mean_s
+    if memory_s == 0:
+        return now
+    return state.lateral_error - xp.expm1(-duration_s(state) / memory_s) * (now - state.lateral_error)
 
 
 def next_lag(
@@ -798,7 +811,7 @@ def reward_errors(
     motion: Motion,
     xp: Any,
 ) -> dict[str, Array]:
-    """The scores and errors of paper Table I by term name, each [...]; the lag is that at the end of the step."""
+    """The scores and errors of paper Table I by term name, each [...]."""
     config, ids = constants.config, constants.ids
     settings = config.reward
     speed = told["forward"]
@@ -811,12 +824,7 @@ def reward_errors(
     foot_speed = xp.sqrt(layout.total(reading.sensordata[..., ids.foot_velocity] ** 2))
     w = layout.numbers(motion.orientation)[0]
     pelvis_error = 1.0 - w * w  # `quaternion_error` from the upright pose (1, 0, 0, 0)
-    forward_error, lateral_error = abs(motion.forward - speed), abs(motion.lateral - told["lateral"])
-    if share := settings.velocity_mean_share:
-        along, across = (abs(lag) / config.termination.lag_memory_s for lag in layout.numbers(state.lag))
-        forward_error = forward_error + share * (along - forward_error)
-        lateral_error = lateral_error + share * (across - lateral_error)
-    speed_error = forward_error + settings.lateral_velocity_share * lateral_error
+    speed_error = abs(motion.forward - speed) + settings.lateral_velocity_share * abs(state.lateral_error)
     if config.command.frame == "world":
         drift = layout.numbers(reading.qpos[..., :2])[1]
         if settings.follow_lateral_command:
