@@ -21,6 +21,7 @@ class Episodes(NamedTuple):
     seconds: np.ndarray  # [N] simulated time upright
     diverged: np.ndarray  # [N] bool: ended by a failure of the simulation, whose step does not count
     reached_goal: np.ndarray  # [N] bool: ended where it was to arrive
+    action_change: np.ndarray  # [N] root mean square over actions of the change from step to step; NaN of a single step
     measures: np.ndarray  # [T, N, M] the task's measures; NaN after an episode's end
 
 
@@ -66,6 +67,7 @@ def run_episodes(
     total, length = np.zeros(episodes), np.zeros(episodes, np.int64)
     reached_cap, diverged, running = np.zeros(episodes, bool), np.zeros(episodes, bool), np.ones(episodes, bool)
     reached_goal = np.zeros(episodes, bool)
+    squares, before = np.zeros(episodes), np.zeros((episodes, task.action_size))
     measures = []
     for step in range(1, int(limit.max()) + 1):
         action, policy = actor.act(policy, state.observation, state.is_first)
@@ -73,6 +75,8 @@ def run_episodes(
             action = action + std * rng.standard_normal(action.shape, np.float32)
         state, result = envs.step(state, action, rng)
         valid = running & ~result.diverged
+        squares += np.where(valid & (length > 0), np.mean((action - before) ** 2, axis=1), 0.0)
+        before = action
         measures.append(np.where(valid[:, None], result.measures, np.nan))
         total += np.where(valid, result.reward, 0.0)
         length += valid
@@ -85,7 +89,8 @@ def run_episodes(
         running = standing & ~over & ~reached_goal
         if not running.any():
             break
-    return Episodes(total, length, reached_cap, length * env_step_s, diverged, reached_goal, np.stack(measures))
+    change = np.where(length > 1, np.sqrt(squares / np.maximum(length - 1, 1)), np.nan)
+    return Episodes(total, length, reached_cap, length * env_step_s, diverged, reached_goal, change, np.stack(measures))
 
 
 class Outcome(NamedTuple):

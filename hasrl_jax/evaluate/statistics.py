@@ -7,6 +7,7 @@ import numpy as np
 from hasrl_jax.envs.task import Command, Task
 from hasrl_jax.evaluate.rollout import Episodes
 
+POWER = "motor_power"  # a measure in W that tasks may have: mean over every whole episode
 SETTLE_S = 3.0  # an error counts from this long after an episode's start or a new command
 
 
@@ -19,9 +20,14 @@ def summarize(episodes: Episodes, task: Task) -> dict[str, Any]:
         "seconds_upright": mean_interval(episodes.seconds),
         "share_reaching_cap": share_interval(episodes.reached_cap),
         "diverged_episodes": int(episodes.diverged.sum()),
+        "action_change": mean_interval(episodes.action_change),
     }
+    column = columns(episodes, task)
+    if POWER in column:
+        steps = np.maximum(episodes.episode_length, 1)
+        summary[POWER] = mean_interval(np.nansum(column[POWER], axis=0) / steps)
     if task.commands:
-        errors = settled_errors(columns(episodes, task), task.commands, task.env_step_s)
+        errors = settled_errors(column, task.commands, task.env_step_s)
         first = errors[task.commands[0].measure]
         summary["settled_episodes"] = int(np.isfinite(first).sum())
         summary |= {name: mean_interval(values) for name, values in errors.items()}

@@ -76,7 +76,7 @@ def test_nothing_counts_after_a_fall(policy, monkeypatch):
 
     def scripted(self, state, action, rng):
         state, result = step(self, state, action, rng)
-        calls.append(1)
+        calls.append(action)
         fell = np.array([len(calls) in (2, 4), False, len(calls) == 6])
         reward = np.array([10.0 ** len(calls), 1.0, 2.0])
         return state, result._replace(reward=reward, terminated=fell, truncated=np.zeros(3, bool))
@@ -88,6 +88,9 @@ def test_nothing_counts_after_a_fall(policy, monkeypatch):
     np.testing.assert_array_equal(episodes.reached_cap, [False, True, False])  # the third falls in its last step
     np.testing.assert_allclose(episodes.seconds, [0.05, 0.15, 0.15])
     assert len(calls) == 6
+    for env, length in enumerate([2, 6, 6]):
+        changes = [(calls[i][env] - calls[i - 1][env]) ** 2 for i in range(1, length)]
+        assert episodes.action_change[env] == pytest.approx(np.sqrt(np.mean(changes)))
     present = np.isfinite(episodes.measures).all(axis=2)
     np.testing.assert_array_equal(present.sum(axis=0), [2, 6, 6])
     assert present[:2, 0].all()

@@ -82,6 +82,8 @@ def test_a_summary_by_hand() -> None:
     measures[:, 0, place("forward_speed")] = 5.0
     measures[-2:, 0, place("forward_speed")] = 0.7, 1.1
     measures[-2:, 0, place("lateral_speed")] = 0.2
+    measures[:, 0, place("motor_power")] = 200.0
+    measures[:, 1, place("motor_power")] = 100.0, 40.0, 10.0, *[np.nan] * (steps - 3)
     measures[3:, 1] = np.nan
     episodes = Episodes(
         episode_return=np.array([10.0, 4.0]),
@@ -90,6 +92,7 @@ def test_a_summary_by_hand() -> None:
         seconds=np.array([steps, 3]) * TASK.env_step_s,
         diverged=np.array([False, True]),
         reached_goal=np.array([False, False]),
+        action_change=np.array([0.3, 0.1]),
         measures=measures,
     )
     found = statistics.summarize(episodes, TASK)
@@ -98,6 +101,8 @@ def test_a_summary_by_hand() -> None:
     assert found["episode_length"]["mean"] == (steps + 3) / 2
     assert found["seconds_upright"]["mean"] == pytest.approx((steps + 3) / 2 * 0.025)
     assert found["share_reaching_cap"]["mean"] == 0.5
+    assert found["action_change"]["mean"] == pytest.approx(0.2)
+    assert found["motor_power"]["mean"] == pytest.approx((200 + 50) / 2)
     expected = {
         **{"forward_speed": 0.9, "forward_command": 1.0, "forward_speed_error": 0.1},
         **{"forward_speed_error_instantaneous": 0.2, "lateral_speed": 0.2, "lateral_command": 0.0},
