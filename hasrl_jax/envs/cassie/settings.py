@@ -69,9 +69,6 @@ class RewardConfig:
     velocity_sharpness: Annotated[float, Limits(0, 1e3)] = 1.0  # factor inside exp(-factor * E_v), 1/(m/s)
     # weight of the lateral speed error in E_v (the paper: 0)
     lateral_velocity_share: Annotated[float, Limits(0, 1e3)] = 1.0
-    # time constant in which the lateral speed error of E_v follows the present one, s: a gait swings sideways by
-    # 0.2 m/s, and a mean that is off by less than it swings costs next to nothing otherwise
-    lateral_mean_s: Annotated[float, Limits(0, 1e3)] = 0.0
     heading_share: Annotated[float, Limits(0, 1e3)] = 1.0  # heading: weight of the heading error (rad) in E_v
     # usual pelvis height above the ground, which P_m asks for unless another is commanded, m
     height_m: Annotated[float, Limits(0, 2)] = 0.9

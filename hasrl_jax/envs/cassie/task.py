@@ -103,7 +103,6 @@ class CassieState(NamedTuple):
     command: Array  # [..., C] in the order of `commands.COMMANDS`
     command_s: Array  # [...] seconds until the command is drawn again
     path: Array  # [..., 2] a point that moves as commanded, world x and y, m
-    lateral_error: Array  # [...] lateral speed less the one commanded, or what follows it, m/s
     lag: Array  # [..., 2] distance by which the robot is behind its commands, along and across; fades with time, m
     target_heading: Array  # [...] the heading to keep, rad; 0 in the world frame
     standing: Array  # [...] bool: the clock rests
@@ -378,7 +377,6 @@ def reset(constants: Constants, uniforms: Array, xp: Any) -> Reset:
         command=command,
         command_s=command_s,
         path=xp.zeros((*batch, 2)),
-        lateral_error=xp.zeros(batch),
         lag=xp.zeros((*batch, 2)),
         target_heading=yaw,
         standing=is_standing(config, command, qvel[..., :2], xp),
@@ -529,7 +527,6 @@ def step(
     told = commands.named(state.command, config.command)
     state = follow(constants, state, reading.qpos, xp)
     motion = motion_of(constants, state, reading, xp)
-    state = state._replace(lateral_error=next_lateral_error(constants, state, told, motion, xp))
     errors = reward_errors(constants, state, told, action, reading, motion, xp)
     terms = rewards.weighted_terms(errors, constants.reward_weights, xp)
     compared = None
@@ -667,16 +664,6 @@ def follow(constants: Constants, state: CassieState, qpos: Array, xp: Any) -> Ca
     drift = frames.turned(state.path + frames.turned(moved, target, xp) - qpos[..., :2], -target, xp)
     drift = xp.stack([xp.zeros_like(target), xp.clip(drift[..., 1], -config.max_drift_m, config.max_drift_m)], axis=-1)
     return state._replace(path=qpos[..., :2] + frames.turned(drift, target, xp), target_heading=target)
-
-
-def next_lateral_error(
-    constants: Constants, state: CassieState, told: dict[str, Array], motion: Motion, xp: Any
-) -> Array:
-    """The lateral speed error of the reward after an environment step, m/s, [...]: e' = e + share (now - e)."""
-    now, memory_s = motion.lateral - told["lateral"], constants.config.reward.lateral_mean_s
-    if memory_s == 0:
-        return now
-    return state.lateral_error - xp.expm1(-duration_s(state) / memory_s) * (now - state.lateral_error)
 
 
 def next_lag(
@@ -824,7 +811,8 @@ def reward_errors(
     foot_speed = xp.sqrt(layout.total(reading.sensordata[..., ids.foot_velocity] ** 2))
     w = layout.numbers(motion.orientation)[0]
     pelvis_error = 1.0 - w * w  # `quaternion_error` from the upright pose (1, 0, 0, 0)
-    speed_error = abs(motion.forward - speed) + settings.lateral_velocity_share * abs(state.lateral_error)
+    forward_error, lateral_error = abs(motion.forward - speed), abs(motion.lateral - told["lateral"])
+    speed_error = forward_error + settings.lateral_velocity_share * lateral_error
     if config.command.frame == "world":
         drift = layout.numbers(reading.qpos[..., :2])[1]
         if settings.follow_lateral_command:
