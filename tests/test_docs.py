@@ -26,7 +26,7 @@ DOCUMENTS = (
     *(f"docs/{name}.md" for name in ("index", "start", "install", "concepts", "howto", "troubleshooting", "faq")),
     *(f"docs/tutorials/{name}.md" for name in ("play", "train")),
     *(f"docs/policies/{name}.md" for name in ("index", "released")),
-    *(f"docs/policies/released-{name}.md" for name in ("steer", "fast", "stairs", "imitate")),
+    *(f"docs/policies/released-{name}.md" for name in ("steer", "fast", "stairs", "imitate", "gaits")),
 )
 FILE = re.compile(r"[\w./-]+\.(?:py|yaml|xml|md|npz|ipynb|lock|toml)")
 COMMAND = re.compile(r"(?:\bhasrl |-m hasrl_jax\.)([a-z]+) ([^|#;&`\n]*)")

@@ -72,7 +72,8 @@ def use(wheel: Path, folder: Path, need_films: bool) -> None:
     assert json.loads((folder / "figures.json").read_text())
     run("hasrl", "export", "--run-dir", "run", "--out", "policy.npz")
     run("hasrl", "evaluate", "--policy", "policy.npz", "--episodes", "1", "--seconds", "1")
-    for released in ("released", "released-steer", "released-fast", "released-stairs", "released-imitate"):
+    for kind in ("", "-steer", "-fast", "-stairs", "-imitate", "-gaits"):
+        released = f"released{kind}"
         run("hasrl", "evaluate", "--policy", released, "--episodes", "1", "--seconds", "1", "--physics", "training")
     run("hasrl", "figures", "curve", "--run-dir", "run", "--out", "curve.png")
     if "True" in run("python", "-c", "from hasrl_jax.visualize import opengl; print(opengl.choose() is not None)"):

@@ -64,6 +64,21 @@ def test_the_policy_that_imitates_walks_with_the_joints_of_its_reference() -> No
     assert (episodes.episode_return > 0.8 * 200).all(), "1 a step is the reference itself"
 
 
+def test_the_policy_that_follows_gaits_needs_less_power_than_the_one_they_come_from() -> None:
+    power = {}
+    for name in ("released-steer", "released-gaits"):
+        config, parameters = policies.load_policy_parameters(None, name)
+        played = to_play(config, "training", [], "evaluate")
+        config = scorecard.row_config(played, scorecard.Row("speed", (1.0, 1.0)), seconds=6.0)
+        task = make_task(config)
+        episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
+        assert episodes.reached_cap.all()
+        found = statistics.summarize(episodes, task)
+        assert found["forward_speed_error"]["mean"] < 0.05
+        power[name] = found["motor_power"]["mean"]
+    assert power["released-gaits"] < 0.75 * power["released-steer"]
+
+
 def test_the_fast_policy_goes_on_where_the_one_that_steers_ends() -> None:
     speeds = {}
     for name in ("released-steer", "released-fast"):
