@@ -12,7 +12,10 @@ def upgraded(values: Any) -> Any:
     """
     if not isinstance(values, dict):
         return values
-    others = set(tasks.BUILT_IN) - {values.get("task", "cassie")}
+    task = values.get("task", "cassie")
+    others = (
+        set(tasks.BUILT_IN) - {task} if task in list(tasks.BUILT_IN) else set()
+    )  # a task of one's own may extend one
     values = {name: value for name, value in values.items() if name not in others}
     if isinstance(values.get("stages"), list):
         values["stages"] = [_stage(stage) for stage in values["stages"]]

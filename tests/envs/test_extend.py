@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from hasrl_jax.envs.cpu_engine import CpuEnvs
 from hasrl_jax.envs.gymnasium import make
 from hasrl_jax.envs.registry import make_task
 from hasrl_jax.policy import loading
+from hasrl_jax.runs import checkpoint
+from hasrl_jax.runs.directory import load_run_config, write_config
 
 MODULE = """
 from dataclasses import dataclass
@@ -113,3 +116,13 @@ def test_a_policy_of_the_task_without_the_command_goes_on_in_it() -> None:
     _, theirs = loading.load_policy_parameters(None, "released")
     assert ours["policy/lstm_0_input"].shape[0] == theirs["policy/lstm_0_input"].shape[0] + 1
     np.testing.assert_array_equal(ours["policy/lstm_0_input"][-1], 0.0)
+
+
+def test_a_run_and_a_policy_of_it_come_back_with_their_settings(tmp_path: Path) -> None:
+    trained = config(calm=0.5, command={"frame": "heading"}, reward={"velocity": 0.9})
+    assert trained.settings.command.frame == "heading"
+    write_config(tmp_path, trained)
+    assert load_run_config(tmp_path) == trained
+    _, parameters = loading.load_baseline("random", trained)
+    checkpoint.save_policy(tmp_path / "policy.npz", parameters, loading.policy_metadata(trained))
+    assert loading.load_policy_parameters(None, tmp_path / "policy.npz")[0] == trained
