@@ -13,9 +13,8 @@ def upgraded(values: Any) -> Any:
     if not isinstance(values, dict):
         return values
     task = values.get("task", "cassie")
-    others = (
-        set(tasks.BUILT_IN) - {task} if task in list(tasks.BUILT_IN) else set()
-    )  # a task of one's own may extend one
+    # A task of one's own may have the settings of the one that it extends.
+    others = set(tasks.BUILT_IN) - {task} if task in list(tasks.BUILT_IN) else set()
     values = {name: value for name, value in values.items() if name not in others}
     if isinstance(values.get("stages"), list):
         values["stages"] = [_stage(stage) for stage in values["stages"]]
