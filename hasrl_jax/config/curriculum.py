@@ -110,7 +110,7 @@ class Stages:
 
 def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
     """`config` with some fields replaced, and checked."""
-    before, env_step_s = config, config.physics.env_step_s
+    before = config
     changeable = (*([config.section] if config.section else []), *CHANGEABLE)
     fields = [field for part in changes.items() for field in flat(dict([part]))]
     for field in fields:
@@ -132,9 +132,9 @@ def _apply(changes: dict[str, Any], config: Config, name: str) -> Config:
         raise ConfigError(f"{name}.set: {error}") from None
     if config.network.learn_std and config.network != before.network:
         raise ConfigError(f"{name}.set: network.initial_log_std: a stage can set it where network.learn_std is false")
-    if not np.isclose(config.physics.env_step_s, env_step_s):
+    if not np.isclose(config.physics.env_step_s, before.physics.env_step_s):
         raise ConfigError(
             f"{name}.set: physics.timestep_s times steps_per_env_step is {config.physics.env_step_s:g} s; expected "
-            f"{env_step_s:g} s, as before"
+            f"{before.physics.env_step_s:g} s, as before"
         )
     return config

@@ -14,6 +14,7 @@ from hasrl_jax.cli.train import parse_train
 from hasrl_jax.config.convert import from_dict
 from hasrl_jax.config.files import shipped
 from hasrl_jax.envs.registry import make_task
+from hasrl_jax.envs.task import Task
 from hasrl_jax.errors import CheckpointError, ConfigError
 from hasrl_jax.evaluate import rollout, scorecard, statistics
 from hasrl_jax.learn import ppo
@@ -64,16 +65,21 @@ def test_the_policy_that_imitates_walks_with_the_joints_of_its_reference() -> No
     assert (episodes.episode_return > 0.8 * 200).all(), "1 a step is the reference itself"
 
 
+def _held(name: str, speed: float, seconds: float) -> tuple[rollout.Episodes, Task]:
+    """Two episodes of a released policy at one speed, told from rest, to their end."""
+    config, parameters = policies.load_policy_parameters(None, name)
+    played = to_play(config, "training", [], "evaluate")
+    config = scorecard.row_config(played, scorecard.Row("speed", (speed, speed)), seconds=seconds)
+    task = make_task(config)
+    episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
+    assert episodes.reached_cap.all()
+    return episodes, task
+
+
 def test_the_policy_that_follows_gaits_needs_less_power_than_the_one_they_come_from() -> None:
     power = {}
     for name in ("released-steer", "released-gaits"):
-        config, parameters = policies.load_policy_parameters(None, name)
-        played = to_play(config, "training", [], "evaluate")
-        config = scorecard.row_config(played, scorecard.Row("speed", (1.0, 1.0)), seconds=6.0)
-        task = make_task(config)
-        episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
-        assert episodes.reached_cap.all()
-        found = statistics.summarize(episodes, task)
+        found = statistics.summarize(*_held(name, 1.0, seconds=6.0))
         assert found["forward_speed_error"]["mean"] < 0.05
         power[name] = found["motor_power"]["mean"]
     assert power["released-gaits"] < 0.75 * power["released-steer"]
@@ -82,12 +88,7 @@ def test_the_policy_that_follows_gaits_needs_less_power_than_the_one_they_come_f
 def test_the_fast_policy_goes_on_where_the_one_that_steers_ends() -> None:
     speeds = {}
     for name in ("released-steer", "released-fast"):
-        config, parameters = policies.load_policy_parameters(None, name)
-        played = to_play(config, "training", [], "evaluate")
-        config = scorecard.row_config(played, scorecard.Row("speed", (4.0, 4.0)), seconds=5.0)
-        task = make_task(config)
-        episodes = rollout.run_episodes(config, task, parameters, episodes=2, seed=0)
-        assert episodes.reached_cap.all()
+        episodes, task = _held(name, 4.0, seconds=5.0)
         speeds[name] = episodes.measures[120:, :, task.measures.index("forward_speed")].mean()
     assert speeds["released-steer"] < 3.0
     assert speeds["released-fast"] > 3.3
