@@ -57,10 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(arguments: argparse.Namespace) -> dict:
-    """Trains and judges every run; prints a line for each on the way.
+    """Trains and judges every run; prints a line for each on the way. Where it is interrupted, what it has until then.
 
     Raises:
-      ConfigError: an impossible argument, or a single core.
+      ConfigError: an impossible argument, or a single core; KeyboardInterrupt: before the first run was over.
     """
     for name in ("seeds", "every", "episodes"):
         if getattr(arguments, name) < 1:
@@ -69,12 +69,18 @@ def measure(arguments: argparse.Namespace) -> dict:
     if not arguments.shared and len(cores) < 2:
         raise ConfigError("--shared: not given, but the learner needs a core of its own, and the workers another")
     config = make_config(arguments, available_cores() if arguments.shared else len(cores) - 1)
-    if arguments.shared:
-        runs = list(take_turns(config, arguments, []))
-    else:
+    runs: list[dict[str, Any]] = []
+    if not arguments.shared:
         pin(os.getpid(), cores[:1])
-        runs = list(take_turns(config, arguments, cores[1:]))
-        pin(os.getpid(), cores)
+    try:
+        for run in take_turns(config, arguments, [] if arguments.shared else cores[1:]):
+            runs.append(run)
+    except KeyboardInterrupt:  # hours are not lost to the last run
+        if not runs:
+            raise
+    finally:
+        if not arguments.shared:
+            pin(os.getpid(), cores)
     names = "speeds", "episodes", "least_up", "most_error", "shared"
     stated = {name: getattr(arguments, name) for name in names}
     return {"config": Path(arguments.config).name, **stated, "num_workers": config.collect.num_workers, "runs": runs}
@@ -92,7 +98,8 @@ def take_turns(config: Config, arguments: argparse.Namespace, cores: list[int]) 
             curve, policies = train_watched(changed, programs[schedule], arguments, cores)
             looks = judge(changed, curve, policies, arguments)
             found = {"schedule": schedule, "seed": seed, **summary(curve, looks), "looks": looks}
-            print(f"{schedule}, seed {seed}: {found['seconds_to_walking']} s", file=sys.stderr, flush=True)
+            shown = {name: value for name, value in found.items() if name not in ("schedule", "seed", "looks")}
+            print(f"{schedule}, seed {seed}: {shown}", file=sys.stderr, flush=True)
             yield found
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from hasrl_jax.cli.options import OneLineParser, require_writable
 from hasrl_jax.cli.parsing import log_to_terminal, policy_to_play, run
-from hasrl_jax.envs.cassie.gaits import save
-from hasrl_jax.evaluate.record_gaits import record
+from hasrl_jax.envs.cassie.gaits import AXES, save
+from hasrl_jax.evaluate.record_gaits import BOUNDS, make_grid, record
 
 
 def write(arguments: list[str]) -> None:
@@ -26,15 +26,21 @@ def write(arguments: list[str]) -> None:
     parser.add_argument(
         "--physics", choices=("paper", "training"), default="training", help="as trained (the default), or 2 kHz"
     )
+    forward, (_, lateral), height = (BOUNDS[name] for name in AXES)
+    parser.add_argument("--forward-m-s", type=float, nargs=2, default=forward, metavar="V", help="slowest and fastest")
+    parser.add_argument("--lateral-m-s", type=float, default=lateral, metavar="V", help="to either side")
+    parser.add_argument("--height-m", type=float, nargs=2, default=height, metavar="M", help="lowest and highest")
     parser.add_argument("--out", type=Path, required=True, help="the file to write, .npz")
     known, rest = parser.parse_known_args(arguments)
     require_writable("--out", known.out, ".npz")
     if known.run_dir is None and known.policy is None:
         known.policy = "released-steer"
-    library = record(*policy_to_play(known, rest, "gaits"))
+    bounds = known.forward_m_s, (0.0, known.lateral_m_s), known.height_m
+    grid = make_grid(dict(zip(AXES, bounds, strict=True)))
+    library = record(*policy_to_play(known, rest, "gaits"), grid)
     save(known.out, library)
-    grid = " x ".join(str(size) for size in library.curves.shape[:3])
-    print(f"{known.out}: {grid} gaits of {library.states.shape[3]} states, {known.out.stat().st_size / 1000:.0f} kB")
+    sizes = " x ".join(str(size) for size in library.curves.shape[:3])
+    print(f"{known.out}: {sizes} gaits of {library.states.shape[3]} states, {known.out.stat().st_size / 1000:.0f} kB")
 
 
 def main(argv: list[str] | None = None) -> int:

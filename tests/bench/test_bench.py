@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,29 @@ def test_walking_trains_and_judges(
         assert [look["iteration"] for look in run["looks"]] == [2, 4]
         assert run["env_steps_to_walking"] == run["looks"][1]["env_steps"] >= 256
         assert 0 < run["looks"][0]["seconds"] < run["seconds_to_walking"] < run["seconds"]
+
+
+@pytest.mark.parametrize("finished", [0, 2])
+def test_an_interrupted_walking_bench_keeps_the_runs_that_are_over(
+    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = "seconds_to_walking env_steps_to_walking iteration_seconds collect_seconds update_seconds wait_seconds"
+    figures_of_a_run = dict.fromkeys((*names.split(), "policy_lag", "seconds", "env_steps"), 1.0)
+
+    def take_turns(*_: Any) -> Iterator[dict[str, Any]]:
+        for seed in range(finished):
+            yield {"schedule": "sync", "seed": seed, **figures_of_a_run}
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(walking, "take_turns", take_turns)
+    cores = os.sched_getaffinity(0)
+    figures = tmp_path / "walking.json"
+    status = main(["walking", "--json", str(figures)])
+    assert os.sched_getaffinity(0) == cores
+    assert status == (0 if finished else 130)
+    assert bool(figures.read_text()) == bool(finished)
+    if finished:
+        assert [run["seed"] for run in json.loads(figures.read_text())["figures"]["runs"]] == [0, 1]
 
 
 def test_who_stands_still_or_falls_does_not_walk() -> None:

@@ -52,9 +52,9 @@ def test_a_curve_is_that_of_de_casteljau(phase: float) -> None:
 def test_a_fit_finds_what_the_curves_can_express_and_joins_the_halves() -> None:
     phase = np.arange(40) / 40
     samples = np.stack([np.full(40, 0.7), np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)], axis=1)
-    coefficients = bezier.fit(samples)
+    coefficients = bezier.fit(samples, phase)
     np.testing.assert_allclose(bezier.value(coefficients[None], phase, np), samples, atol=2e-3)
-    rough = bezier.fit(np.random.default_rng(1).normal(size=(40, 2)))
+    rough = bezier.fit(np.random.default_rng(1).normal(size=(40, 2)), phase)
     for end, begin in ((0, 1), (1, 0)):
         np.testing.assert_allclose(rough[end, :, 5], rough[begin, :, 0])
         slopes = rough[end, :, 5] - rough[end, :, 4], rough[begin, :, 1] - rough[begin, :, 0]
@@ -236,8 +236,14 @@ def test_a_residual_action_is_added_to_the_reference_of_the_end_of_the_step() ->
         ({"reference": {"gaits": ""}}, r"reference\.gaits: got ''; expected library, or .*start_share needs one"),
         ({"reference": {"gaits": "nowhere.npz"}}, r"gaits: got 'nowhere.npz', which does not exist; expected library"),
         ({"reference": {"min_reward": 0.3}}, r"cassie\.reference\.min_reward: got 0\.3; expected 0 where no term of"),
-        ({"clock": {"cycle_s": 0.8}}, r"cassie\.clock\.cycle_s: got 0\.8; expected 0\.75 s at all speeds"),
-        ({"clock": {"cycle_per_speed_s": -0.1}}, r"cassie\.clock\.cycle_s: got 0\.75; expected 0\.75 s at all speeds"),
+        (
+            {"clock": {"cycle_s": 0.8}},
+            r"cassie\.clock\.cycle_s: got 0\.8; expected what makes a cycle of 0\.75 s at \S+ m/s",
+        ),
+        (
+            {"clock": {"cycle_per_speed_s": -0.1}},
+            r"cassie\.clock\.cycle_per_speed_s: got -0\.1; expected what makes a cycle of 0\.75 s at \S+ m/s",
+        ),
         (
             {"reference": {"residual": True}, "command": {"forward_m_s": [0.0, 4.0]}},
             r"cassie\.command\.forward_m_s: got \(0\.0, 4\.0\); expected within -0\.5 to 2\.5, where there are gaits",

@@ -40,17 +40,18 @@ def value(coefficients: Array, phase: Array, xp: Any) -> Array:
     return (of_half * bernstein(xp.mod(place, 1.0), xp)[..., None, :]).sum(axis=-1)
 
 
-def fit(samples: np.ndarray) -> np.ndarray:
-    """The curves nearest to samples that are spread evenly over a cycle, by least squares.
+def fit(samples: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """The curves nearest to samples, by least squares.
 
     Args:
-      samples: [N, Q], the first at phase 0.
+      samples: [N, Q].
+      phase: of each in [0, 1), [N].
 
     Returns:
       coefficients [2, Q, 6].
     """
     count = len(samples)
-    place = HALVES * np.arange(count) / count
+    place = HALVES * phase
     design = np.zeros((count, HALVES, COEFFICIENTS))
     design[np.arange(count), (place >= 1).astype(int)] = bernstein(np.mod(place, 1.0), np)
     joined = _joined()

@@ -103,10 +103,14 @@ def _draw_in_heading(uniforms: Array, config: CommandConfig, usual_height_m: flo
     fastest_turn = config.turn_m_s2 / xp.maximum(speed, 0.01)
     widest = max(abs(end) for end in config.yaw_rate_rad_s)
     yaw_rate = yaw_rate * xp.minimum(1.0, fastest_turn / max(widest, 1e-6))
-    low, high = config.height_fade_m_s
-    share = xp.clip((high - speed) / max(high - low, 1e-6), 0.0, 1.0) * has_height
-    height = usual_height_m + share * (height - usual_height_m)
+    height = usual_height_m + height_share(speed, config, xp) * has_height * (height - usual_height_m)
     return columns([forward, lateral, yaw_rate, height], xp)
+
+
+def height_share(speed: Array, config: CommandConfig, xp: Any) -> Array:
+    """How much of a height's difference from the usual one is commanded at a forward speed, m/s: [...] -> [...]."""
+    low, high = config.height_fade_m_s
+    return xp.clip((high - xp.abs(speed)) / max(high - low, 1e-6), 0.0, 1.0)
 
 
 def next_command(

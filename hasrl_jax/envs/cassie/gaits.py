@@ -60,10 +60,10 @@ class Library(NamedTuple):
     lateral_m_s: np.ndarray  # [L]; in a file only those that are not negative
     height_m: np.ndarray  # [H]
     curves: np.ndarray  # [F, L, H, 2, Q, 6] Bezier coefficients of MOTION
-    states: np.ndarray  # [F, L, H, N, 67] STATE at phases 0, 1/N, ...
+    states: np.ndarray  # [F, L, H, N, 67] STATE at phases 0, 1/N, ..., to half a step of the policy
     standing: np.ndarray  # [H, Q] MOTION while the robot stands
     standing_states: np.ndarray  # [H, 67]
-    cycle_s: float  # duration of a gait cycle
+    cycle_s: np.ndarray  # [F] duration of a gait cycle
     policy_rate_hz: float  # of the policy that was recorded
     joints: tuple[str, ...]  # of the robot, in the order of qpos
 
@@ -125,6 +125,8 @@ def _load(path: Path, changed: int, sha256: str) -> Library:
         with np.load(path, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             arrays = {name: file[name].astype(float) for name in Library._fields if name not in about}
+        if "cycle_s" in about:  # files of earlier releases: one for all
+            arrays["cycle_s"] = np.full(len(arrays["forward_m_s"]), about.pop("cycle_s"))
         half = Library(**arrays, **about | {"joints": tuple(about["joints"])})
         _require_whole(half)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
@@ -137,6 +139,7 @@ def _require_whole(library: Library) -> None:
     grid = tuple(len(getattr(library, name)) for name in AXES)
     phases = library.states.shape[3:4]
     shapes = {
+        "cycle_s": grid[:1],
         "curves": (*grid, bezier.HALVES, MOTION_SIZE, bezier.COEFFICIENTS),
         "states": (*grid, *phases, layout.size(STATE)),
         "standing": (grid[2], MOTION_SIZE),
