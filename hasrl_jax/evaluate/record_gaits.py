@@ -4,6 +4,7 @@ All gaits are walked side by side. Since no policy walks exactly as told, each i
 a gait's place in the library is how it moves, not what was asked for.
 """
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.policy import actor
 from hasrl_jax.policy.numpy_networks import Parameters
 
-STEPS = {"forward_m_s": 0.5, "height_m": 0.1}  # between gaits; one lateral speed to each side
+STEPS = {"forward_m_s": 0.5, "lateral_m_s": 0.5, "height_m": 0.1}
 BOUNDS = {"forward_m_s": (-0.5, 2.5), "lateral_m_s": (0.0, 0.3), "height_m": (0.8, 1.0)}
 TRIALS = 6  # walks of the whole grid, of which each gait's best is kept
 STAND_TRIALS = 3
@@ -43,20 +44,18 @@ class Walked(NamedTuple):
 
 
 def make_grid(bounds: Mapping[str, tuple[float, float]]) -> dict[str, np.ndarray]:
-    """Evenly spaced values between the `bounds` of each of `gaits.AXES`, a whole number of STEPS apart.
+    """Evenly spaced values, about STEPS apart, from the lower to the upper bound of each of `gaits.AXES`.
 
     Raises:
-      ConfigError: names the option that gives no two values.
+      ConfigError: names the option whose bounds are not in order.
     """
     grid = {}
     for name in gaits.AXES:
         low, high = bounds[name]
-        step = STEPS.get(name, high - low)
-        number = round((high - low) / step) if step > 0 else 0
-        if number < 1 or abs(low + number * step - high) > 1e-6:
-            least = f"more than {low:g}" if name not in STEPS else f"two that are a multiple of {step:g} apart"
-            raise ConfigError(f"--{name.replace('_', '-')}: got {low:g} {high:g}; expected {least}")
-        grid[name] = low + step * np.arange(number + 1)
+        if not -math.inf < low < high < math.inf:
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option}: got {low:g} {high:g}; expected the lower of two numbers first")
+        grid[name] = np.linspace(low, high, max(2, round((high - low) / STEPS[name]) + 1))
     return grid
 
 

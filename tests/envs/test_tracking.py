@@ -116,7 +116,7 @@ def _reading(task, state: np.ndarray) -> Reading:
 @pytest.mark.parametrize("name", ["cassie_imitate", "cassie_gaits"])
 def test_a_robot_in_the_recorded_state_earns_nearly_all_and_one_elsewhere_less(name: str) -> None:
     """The step that ends in the state after the one in which the episode began, but for what sensors would say."""
-    library = gaits.load(gaits.PACKAGED)
+    library = gaits.load(gaits.USUAL)
     forward, count = 3, library.states.shape[3]  # 1 m/s
     middle, height = len(library.lateral_m_s) // 2, int(np.abs(library.height_m - 0.9).argmin())
     command = {"forward_m_s": [1.0, 1.0], "lateral_m_s": [0, 0], "stand_probability": 0.0, "start_heading_rad": 0.0}
@@ -190,7 +190,7 @@ def test_the_mirror_image_of_a_robot_earns_the_same(name: str) -> None:
     image = state._replace(
         phase=np.mod(state.phase + 0.5, 1.0), command=state.command * [1, -1, -1, 1][: state.command.shape[1]]
     )
-    library = gaits.load(gaits.PACKAGED)
+    library = gaits.load(gaits.USUAL)
     robot = library.states[2, -1, 0, 7] + rng.normal(scale=0.02, size=67)
     action = rng.uniform(-0.2, 0.2, (1, 10))
     uniforms = np.full((1, task.step_uniforms), 0.5)

@@ -21,7 +21,7 @@ def test_a_small_library_by_the_command(tmp_path, monkeypatch):
         monkeypatch.setattr(record_gaits, name, value)
     bounds = ("--forward-m-s", "0.5", "1", "--lateral-m-s", "0.3", "--height-m", "0.8", "0.9")
     assert command.main([*bounds, "--out", str(tmp_path / "gaits.npz")]) == 0
-    ours, whole = gaits.load(str(tmp_path / "gaits.npz")), gaits.load(gaits.PACKAGED)
+    ours, whole = gaits.load(str(tmp_path / "gaits.npz")), gaits.load(gaits.USUAL)
     assert ours.curves.shape == (2, 3, 2, 2, gaits.MOTION_SIZE, 6)
     assert ours.states.shape == (2, 3, 2, 30, 67)
     np.testing.assert_allclose(ours.cycle_s, [0.75, 0.75])
@@ -44,23 +44,25 @@ def test_a_small_library_by_the_command(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--forward-m-s", "0", "0.8"], "--forward-m-s: got 0 0.8; expected two that are a multiple of 0.5 apart"),
-        (["--forward-m-s", "1", "1"], "--forward-m-s: got 1 1; expected two that are a multiple of 0.5 apart"),
-        (["--height-m", "0.9", "0.8"], "--height-m: got 0.9 0.8; expected two that are a multiple of 0.1 apart"),
-        (["--lateral-m-s", "0"], "--lateral-m-s: got 0 0; expected more than 0"),
+        (["--forward-m-s", "1", "1"], "--forward-m-s: got 1 1; expected the lower of two numbers first"),
+        (["--height-m", "0.9", "0.8"], "--height-m: got 0.9 0.8; expected the lower of two numbers first"),
+        (["--height-m", "0.9", "nan"], "--height-m: got 0.9 nan; expected the lower of two numbers first"),
+        (["--lateral-m-s", "0"], "--lateral-m-s: got 0 0; expected the lower of two numbers first"),
     ],
 )
-def test_a_grid_without_two_values_is_refused(options, message, tmp_path, capsys):
+def test_bounds_that_are_not_in_order_are_refused(options, message, tmp_path, capsys):
     assert command.main([*options, "--out", str(tmp_path / "gaits.npz")]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_the_grid_of_the_package():
+def test_the_grid_of_the_package_and_one_that_is_no_multiple_of_the_step():
     found = record_gaits.make_grid(record_gaits.BOUNDS)
-    whole = gaits.load(gaits.PACKAGED)
+    whole = gaits.load(gaits.USUAL)
     np.testing.assert_allclose(found["forward_m_s"], whole.forward_m_s)
     np.testing.assert_allclose(found["lateral_m_s"], [0.0, 0.3])
     np.testing.assert_allclose(found["height_m"], whole.height_m)
+    wider = record_gaits.make_grid(record_gaits.BOUNDS | {"height_m": (0.65, 1.0)})
+    np.testing.assert_allclose(wider["height_m"], [0.65, 0.65 + 0.35 / 3, 0.65 + 0.7 / 3, 1.0])
 
 
 def test_curves_and_states_of_made_up_robots():

@@ -27,9 +27,13 @@ from hasrl_jax.errors import ConfigError
 from hasrl_jax.types import Array
 
 FIELD = "cassie.reference.gaits"
-PACKAGED = "library"  # the name of the one that comes with the package
-PACKAGED_FILE = Path(__file__).parent / "gaits.npz"
-PACKAGED_SHA256 = "03abdca0a2df544d1065e51d8683c82da4977a6f9c8f59cf82336584a49a6a37"
+USUAL = "library"  # recorded from released-steer
+FAST = "library_fast"  # from released-fast: faster, further to the side, lower
+# Those of the package: file, and its SHA-256.
+PACKAGED = {
+    USUAL: ("gaits.npz", "03abdca0a2df544d1065e51d8683c82da4977a6f9c8f59cf82336584a49a6a37"),
+    FAST: ("gaits_fast.npz", "c5d099ac0ad4f69d4a2e62e53724d514df8ed29d668dfe993abc3c1ea9c1f74a"),
+}
 # What a curve says of each phase, in order.
 MOTION = (
     Entry("motor_positions", "rad", MOTOR_SIGNS, legs=True),
@@ -100,19 +104,20 @@ def save(path: Path, library: Library) -> None:
 
 
 def load(source: str) -> Library:
-    """The gaits of PACKAGED or of a file, with those of negative lateral speeds.
+    """The gaits of one of PACKAGED or of a file, with those of negative lateral speeds.
 
     Raises:
       ConfigError: there is no such file, it is damaged, or it is not the one of this release.
     """
-    path = PACKAGED_FILE if source == PACKAGED else Path(source)
+    name, sha256 = PACKAGED.get(source, (source, ""))
+    path = Path(__file__).parent / name if sha256 else Path(source)
     try:
         changed = path.stat().st_mtime_ns
     except (OSError, ValueError):
         raise ConfigError(
-            f"{FIELD}: got {source!r}, which does not exist; expected {PACKAGED}, or a file of `hasrl gaits`"
+            f"{FIELD}: got {source!r}, which does not exist; expected {', '.join(PACKAGED)}, or a file of `hasrl gaits`"
         ) from None
-    return _load(path, changed, PACKAGED_SHA256 if source == PACKAGED else "")
+    return _load(path, changed, sha256)
 
 
 @functools.lru_cache(maxsize=4)

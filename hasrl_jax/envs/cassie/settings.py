@@ -181,7 +181,7 @@ class TrackingConfig:
 
 @dataclass(frozen=True)
 class ReferenceConfig:
-    # the gaits that are used below: none, those of the package ("library"), or a file of `hasrl gaits`
+    # the gaits that are used below: none, those of the package ("library", "library_fast"), or a file of `hasrl gaits`
     gaits: str = ""
     # share of episodes that begin in a state of the gait nearest to their command, at any phase
     start_share: Share = 0.0

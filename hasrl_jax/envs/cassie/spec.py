@@ -87,7 +87,7 @@ def _check_reference(config: Config) -> None:
         "0 where no term of cassie.reference.reward has a weight",
     )
     if not reference.gaits:
-        works = f"{gaits.PACKAGED}, or a file of `hasrl gaits`, where {', '.join(used)} needs one"
+        works = f"{', '.join(gaits.PACKAGED)}, or a file of `hasrl gaits`, where {', '.join(used)} needs one"
         require(not used, gaits.FIELD, reference.gaits, works)
         return
     library = gaits.load(reference.gaits)

@@ -63,7 +63,7 @@ def library_of(config: Config) -> gaits.Library:
     """
     if not isinstance(config.settings, CassieConfig):
         raise ConfigError(f"task: the pictures show Cassie's gaits, and the policy is of {config.task!r}")
-    return gaits.load(config.settings.reference.gaits or gaits.PACKAGED)
+    return gaits.load(config.settings.reference.gaits or gaits.USUAL)
 
 
 def foot_path(library: gaits.Library, model: mujoco.MjModel, cell: tuple[int, ...]) -> np.ndarray:
