@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -226,6 +227,31 @@ def test_clocks_of_workers_that_jump_by_a_year_and_a_cache_that_cannot_be_writte
     assert "Traceback" not in done.stderr
     record = last_record(tmp_path / "run")
     assert (record["iteration"], record["workers_lost"]) == (4, 0)
+
+
+def test_a_full_cache_costs_nothing_and_what_was_cut_off_in_it_neither(tiny: Path, tmp_path: Path) -> None:
+    """The cache is a file system of its own that holds half a compiled program; the second start finds that half."""
+    mounted = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    if not shutil.which("unshare") or subprocess.run([*mounted, "mount -t tmpfs none /mnt"], check=False).returncode:
+        pytest.skip("no file system may be mounted here")
+    (cache := tmp_path / "cache").mkdir()
+    runs = [tmp_path / "first", tmp_path / "second"]
+    first, second = (" ".join(train("--config", tiny, "--run-dir", run)) for run in runs)
+    script = f"mount -t tmpfs -o size=8k none {cache} && {first} && ls {cache}/hasrl_jax/compiled && {second}"
+    changed = {"XDG_CACHE_HOME": str(cache)}
+    done = subprocess.run(
+        [*mounted, script],
+        env=environment() | changed,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert [last_record(run)["iteration"] for run in runs] == [4, 4]
+    assert "-cache\n" in done.stdout, "nothing was left in it"
 
 
 def test_too_few_open_files_are_one_line(tiny: Path, tmp_path: Path) -> None:
