@@ -39,7 +39,7 @@ RELEASED_SHA256 = {
     "released-fast": "fa793bf329a7969197ccc8d0ec9c56dd131208adef00b21cec31acc281d43722",
     "released-stairs": "926daae42a0574c42803f9fd5b3fd5cdc8622f4b7cace6329c088de929903590",
     "released-imitate": "404d32723b025372d7d04b97b978f70472b63510093d9747041f9dcd8ec9c68c",
-    "released-gaits": "dd1e6076c75b4b37f37ec3886310eb0765220b05c0bede2660647440205bae1e",
+    "released-gaits": "09201d2dfbecca2bda5ed923f3856cdaf927bc5293dfb2598be4cf51a19a1bc7",
 }
 
 
