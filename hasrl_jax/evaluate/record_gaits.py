@@ -1,7 +1,7 @@
 """Records a gait library from a policy that walks as commanded, see `envs/cassie/gaits.py`.
 
 All gaits are walked side by side. Since no policy walks exactly as told, each is told again by what it missed, so that
-a gait's place in the library is how it moves, not what was asked for.
+a gait's place in the library is how it moves, not what was asked for; its clock is that of its place.
 """
 
 import math
@@ -12,6 +12,7 @@ import numpy as np
 
 from hasrl_jax.config import tasks
 from hasrl_jax.config.schema import Config
+from hasrl_jax.envs import layout
 from hasrl_jax.envs.cassie import bezier, clock, commands, gaits
 from hasrl_jax.envs.cassie.ids import CassieIds, cassie_ids
 from hasrl_jax.envs.cassie.settings import CassieConfig
@@ -81,14 +82,14 @@ def record(config: Config, parameters: Parameters, grid: Mapping[str, np.ndarray
         raise ConfigError(f"cassie.clock.cycle_s: got {cycle_s:g}; expected an even number of policy steps")
     cells = np.stack(np.meshgrid(*(grid[name] for name in gaits.AXES), indexing="ij"), axis=-1)
     wanted = walkable(cells.reshape(-1, 3), config.settings)
-    told = np.insert(wanted, 2, NOT_A_STAND, axis=1)
-    walked = walk(config, task, parameters, told, count)
+    told = gait = np.insert(wanted, 2, NOT_A_STAND, axis=1)
+    walked = walk(config, task, parameters, gait, told, count)
     require_upright(walked, told)
     gain = np.ones((len(told), 1))
     for _ in range(TRIALS - 1):
         tried = told.copy()
         tried[:, [0, 1, 3]] += gain * (wanted - walked.measured)
-        trial = walk(config, task, parameters, tried, count)
+        trial = walk(config, task, parameters, gait, tried, count)
         better = missed(trial, wanted) < missed(walked, wanted)
         told = np.where(better[:, None], tried, told)
         gain = np.where(better[:, None], gain, gain / 2)
@@ -164,7 +165,7 @@ def stand(config: Config, task: Task, parameters: Parameters, heights: np.ndarra
     told = np.zeros((len(heights), 4))
     told[:, 3] = heights
     for _ in range(STAND_TRIALS):
-        walked = walk(config, task, parameters, told, count)
+        walked = walk(config, task, parameters, told, told, count)
         require_upright(walked, told)
         speeds = np.abs(walked.states[..., gaits.QPOS_SIZE :]).max(axis=(0, 1, 3))
         moves = speeds > MOST_STANDING_RAD_S
@@ -176,22 +177,25 @@ def stand(config: Config, task: Task, parameters: Parameters, heights: np.ndarra
     return states
 
 
-def walk(config: Config, task: Task, parameters: Parameters, told: np.ndarray, count: int) -> Walked:
-    """Robots that hold commands, `told` [G, 4] as COMMANDS, at `count` phases of a cycle."""
+def walk(config: Config, task: Task, parameters: Parameters, gait: np.ndarray, told: np.ndarray, count: int) -> Walked:
+    """Robots at `count` phases of a cycle, with the clock of `gait` [G, 4] as COMMANDS while the policy sees `told`."""
     assert task.with_command is not None
+    command = slice(layout.places(task.observation)["forward_command"].start, None)
     envs = CpuEnvs(task, len(told), np.iinfo(np.int64).max)
     rng = np.random.Generator(np.random.Philox(0))
     state = envs.reset(rng)
     at_phase_0 = state.task._replace(phase=np.zeros(len(told)))
-    task_state, observation = task.with_command(at_phase_0, state.observation, told, np)
+    task_state, observation = task.with_command(at_phase_0, state.observation, gait, np)
     state = state._replace(task=task_state, observation=observation)
     cycles = np.arange(SETTLE_CYCLES, SETTLE_CYCLES + KEPT_CYCLES)[:, None, None] + (np.arange(count) / count)[:, None]
-    cycle_steps = clock.cycle_seconds(told[:, 0], config.settings.clock, np) / task.env_step_s
+    cycle_steps = clock.cycle_seconds(gait[:, 0], config.settings.clock, np) / task.env_step_s
     places = np.rint(cycles * cycle_steps).astype(int)  # [K, N, G] steps
     policy, every, fell = actor.reset(config, task, parameters, len(told)), [], np.zeros(len(told), bool)
     for _ in range(places.max() + 1):
         every.append(state.physics[:, 1:])
-        action, policy = actor.act(policy, state.observation, state.is_first)
+        seen = state.observation.copy()
+        seen[:, command] = told
+        action, policy = actor.act(policy, seen, state.is_first)
         state, result = envs.step(state, action, rng)
         fell |= result.terminated | result.diverged
     states = np.array(every)[places, np.arange(len(told))]

@@ -87,11 +87,11 @@ def test_the_fast_gaits_walk_as_their_places_say_but_lower_at_speed() -> None:
     forward, lateral, height = np.moveaxis(fast.states[..., [35, 36, 2]].mean(axis=-2), -1, 0)
     off_forward = np.abs(forward - fast.forward_m_s[:, None, None])
     off_lateral = np.abs(lateral - fast.lateral_m_s[:, None])
-    assert off_forward.mean() < 0.04
+    assert off_forward.mean() < 0.05
     assert off_lateral.mean() < 0.02
     straight = off_forward[:, 1]
     assert straight[:-1].max() < 0.07
-    assert straight[-1].max() < 0.12  # 4 m/s is more than the policy walks
+    assert straight[-1].max() < 0.15  # 4 m/s is more than the policy walks
     walking = (fast.forward_m_s >= 0.0) & (fast.forward_m_s <= 1.5)
     assert np.abs(height[walking] - fast.height_m).max() < 0.03
     np.testing.assert_allclose(height[-1], 0.81, atol=0.02)
@@ -111,6 +111,28 @@ def test_curves_are_the_recorded_motion(source: str, mean: float, most: float) -
         off.append(curves[:, gaits.PLACES["motor_positions"]] - library.states[cell][:, ids.motor_qpos])
     assert np.sqrt(np.mean(np.square(off))) < mean
     assert np.abs(off).max() < most
+
+
+@pytest.mark.parametrize("source", gaits.PACKAGED)
+def test_joints_move_along_the_curves_as_fast_as_the_cycle_says(source: str) -> None:
+    """The recorded joint velocities by the slope of the curves over time, at every forward speed.
+
+    Less than 1, since motors jerk from target to target and are often slower at the moment of a recording.
+    """
+    library = gaits.load(source)
+    ids = cassie_ids(make_task(_config()).model)
+    count, small = library.states.shape[3], 1e-4
+    phase = np.arange(count) / count
+    motors = gaits.PLACES["motor_positions"]
+    for forward, cycle_s in enumerate(library.cycle_s):
+        slopes, recorded = [], []
+        for cell in np.ndindex(library.states.shape[1:3]):
+            curve = library.curves[(forward, *cell)][None]
+            ends = [bezier.value(curve, np.mod(phase + step, 1.0), np)[:, motors] for step in (-small, small)]
+            slopes.append((ends[1] - ends[0]) / (2 * small * cycle_s))
+            recorded.append(library.states[(forward, *cell)][:, gaits.QPOS_SIZE + ids.motor_qvel])
+        a, b = np.ravel(slopes), np.ravel(recorded)
+        assert 0.75 < a @ b / (a @ a) < 1.0, library.forward_m_s[forward]
 
 
 def test_the_mirror_image_of_a_gait_is_the_one_to_the_other_side_half_a_cycle_later() -> None:

@@ -94,12 +94,18 @@ def test_curves_and_states_of_made_up_robots():
 
 
 def test_a_quicker_clock_is_recorded_at_its_phases(monkeypatch):
-    """Told 2 and 4 m/s, cycles of 30 and 24 steps: a phase is missed by half a step at most, and only by the second."""
+    """Gaits of 2 and 4 m/s, cycles of 30 and 24 steps: a phase is missed by half a step, and only by the second.
+
+    What the robots are told instead makes them slower, and leaves the clock alone.
+    """
     config, parameters = loading.load_policy_parameters(None, "released-fast")
     monkeypatch.setattr(record_gaits, "SETTLE_CYCLES", 1)
     monkeypatch.setattr(record_gaits, "KEPT_CYCLES", 2)
-    told = np.array([[2.0, 0.0, 1e-6, 0.9], [4.0, 0.0, 1e-6, 0.9]])
-    walked = record_gaits.walk(config, make_task(config), parameters, told, 30)
+    gait = np.array([[2.0, 0.0, 1e-6, 0.9], [4.0, 0.0, 1e-6, 0.9]])
+    walked = record_gaits.walk(config, make_task(config), parameters, gait, gait, 30)
+    slower = record_gaits.walk(config, make_task(config), parameters, gait, gait * [0.5, 1.0, 1.0, 1.0], 30)
+    np.testing.assert_array_equal(slower.phase, walked.phase)
+    assert slower.measured[0, 0] < walked.measured[0, 0] - 0.3
     off = (walked.phase[0] - np.arange(30)[:, None] / 30 + 0.5) % 1.0 - 0.5
     np.testing.assert_allclose(off[:, 0], 0.0, atol=1e-9)
     assert 0.25 / 24 < np.abs(off[:, 1]).max() < 0.51 / 24
@@ -134,7 +140,8 @@ def test_of_every_gait_the_best_walk_is_kept(monkeypatch):
     """Robots that walk half as fast as they are told, and fall when they are told 3 m/s."""
     asked = []
 
-    def walk(config, task, parameters, told, count):
+    def walk(config, task, parameters, gait, told, count):
+        np.testing.assert_array_equal(gait[:, 0], [1.0, 2.0])
         asked.append(told.copy())
         states = np.full((1, count, len(told), 67), len(asked))
         measured = told[:, [0, 1, 3]] * [0.5, 1.0, 1.0]
