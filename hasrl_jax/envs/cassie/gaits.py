@@ -29,10 +29,11 @@ from hasrl_jax.types import Array
 FIELD = "cassie.reference.gaits"
 USUAL = "library"  # recorded from released-steer
 FAST = "library_fast"  # from released-fast: faster, further to the side, lower
+_FOLDER = Path(__file__).parent
 # Those of the package: file, and its SHA-256.
 PACKAGED = {
-    USUAL: ("gaits.npz", "03abdca0a2df544d1065e51d8683c82da4977a6f9c8f59cf82336584a49a6a37"),
-    FAST: ("gaits_fast.npz", "5df6c5f4b8cb66b23deab543bdababb084cc98f98d0adef355faecb9620e62d8"),
+    USUAL: (_FOLDER / "gaits.npz", "03abdca0a2df544d1065e51d8683c82da4977a6f9c8f59cf82336584a49a6a37"),
+    FAST: (_FOLDER / "gaits_fast.npz", "5df6c5f4b8cb66b23deab543bdababb084cc98f98d0adef355faecb9620e62d8"),
 }
 # What a curve says of each phase, in order.
 MOTION = (
@@ -109,8 +110,7 @@ def load(source: str) -> Library:
     Raises:
       ConfigError: there is no such file, it is damaged, or it is not the one of this release.
     """
-    name, sha256 = PACKAGED.get(source, (source, ""))
-    path = Path(__file__).parent / name if sha256 else Path(source)
+    path, sha256 = PACKAGED.get(source, (Path(source), ""))
     try:
         changed = path.stat().st_mtime_ns
     except (OSError, ValueError):
